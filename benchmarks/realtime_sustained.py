@@ -49,7 +49,7 @@ LONG_FRAMES = int(os.environ.get("FAINTSPOT_SUSTAINED_FRAMES", "1000000"))
 LONG_RATE_HZ = float(os.environ.get("FAINTSPOT_SUSTAINED_HZ", "500"))
 BUSY_RATE_HZ, BUSY_PRIORITY, MOST_LATE = 300, 80, 1e-3
 _STREHL = 1
-"""Place of the Strehl ratio in `faintspot.engine.telescope.simulated_telescope.TRUTH`."""
+"""Place of the Strehl ratio in `faintspot.engine.telescope.TRUTH`."""
 
 
 def _sustained(name: str, values: dict[str, Any], rate_hz: int) -> Row:

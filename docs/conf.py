@@ -19,7 +19,7 @@ from sphinx_gallery.sorting import FileNameSortKey
 
 from faintspot.cli import group, module_of
 from faintspot.loop.control.options import ControlOptions
-from faintspot.slopes.estimators.documentation import all_tables, option_table
+from faintspot.slopes.estimators.registry import all_tables, option_table
 from faintspot.slopes.pipeline.settings import SharedOptions
 
 HERE = Path(__file__).parent

@@ -15,7 +15,7 @@ from tests.cli.cli_cases import CONFIGURATION, Commands, assert_equal, expected,
 import faintspot as fs
 from faintspot import InputError
 from faintspot.base import extras
-from faintspot.cli.realtime.command import command as realtime
+from faintspot.cli.realtime import command as realtime
 
 SCRIPT = Path(__file__).with_name("beyond_linux.py")
 STUDY = """

@@ -7,7 +7,7 @@ import threading
 import numpy as np
 import pytest
 
-from faintspot.cli.realtime.stopping import stop_on_signal
+from faintspot.cli.shared.engine_requests import stop_on_signal
 from faintspot.slopes.kernels.driver import streaming
 
 pytestmark = pytest.mark.slow

@@ -85,17 +85,6 @@ def test_scales_of_the_configuration_are_stored(run: Commands, slopes: Path) -> 
     assert "mean (nm)" in run.ok("wavefront", "scaled.npz").out
 
 
-def test_units(run: Commands, slopes: Path, no_picture: None) -> None:
-    scale = ("--pixel-scale-arcsec", 30, "--diameter-m", 0.006)
-    waves = ("--unit", "waves", "--wavelength-nm", 850, "-o", "w.json")
-    out = run.ok("wavefront", slopes, *scale, *waves).out
-    assert "mean (waves)" in out
-    assert "850 nm" in out
-    run.ok("wavefront", slopes, *scale, "--unit", "um", "-o", "um.json")
-    in_waves, um = (parse_json(Path(name).read_text()) for name in ("w.json", "um.json"))
-    np.testing.assert_allclose(0.85 * np.array(in_waves["frames"]["rms"]), um["frames"]["rms"])
-
-
 def test_command_that_flattens(run: Commands, slopes: Path, coarse_pictures: None) -> None:
     np.save("mirror.npy", np.random.default_rng(1).normal(size=(32, 6)))
     out = run.ok("wavefront", slopes, "--actuators", "mirror.npy").out
@@ -183,9 +172,6 @@ def test_one_line_names_an_argument_that_cannot_be_used(run: Commands, slopes: P
         ((slopes, "-o", "w.txt"), ("w.txt", ".json")),
         ((slopes, "--modes", 30), ("modes = 30", "from 2 to 24")),
         ((slopes, "--pixel-scale-arcsec", -1), ("pixel_scale_arcsec", "-1")),
-        ((slopes, "--unit", "um"), ("pixel_scale_arcsec",)),
-        ((slopes, *SCALES, "--unit", "waves"), ("wavelength_nm",)),
-        ((slopes, *SCALES, "--wavelength-nm", 500), ("wavelength_nm",)),
         ((slopes, "--minus", "nothing.npz"), ("nothing.npz",)),
         ((slopes, "--minus", "other.npz"), ("other.npz", "16 sub-apertures", "same --config")),
         ((slopes, "--stroke", 1), ("--actuators",)),

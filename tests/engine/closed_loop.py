@@ -20,7 +20,7 @@ from faintspot.engine.engine import Engine
 from faintspot.engine.loop.control_loop import ControlLoop
 from faintspot.engine.pixels.segment import FOLDER
 from faintspot.engine.telemetry.ring import TelemetryRing
-from faintspot.engine.telescope.simulated_telescope import TRUTH, SimulatedTelescope
+from faintspot.engine.telescope import TRUTH, SimulatedTelescope
 from faintspot.loop.control.base import INTEGRATOR
 from faintspot.loop.control.configuration import Control, load_control
 from faintspot.loop.simulation.engine_files import write_engine_files

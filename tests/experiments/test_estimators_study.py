@@ -10,7 +10,7 @@ from tests.experiments.study_cases import cells, dataset, power_law
 from tests.shared_data import shared_file
 
 from faintspot.base.report import plots
-from faintspot.experiments.report.page import (
+from faintspot.experiments.report import (
     compares_estimators,
     enough_photons,
     estimator_figures,

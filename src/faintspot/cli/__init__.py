@@ -35,8 +35,6 @@ _COMMANDS = {
 _MODULES = {
     "layout": "layout.command",
     "live": "realtime.live",
-    "loop": "loop.command",
-    "realtime": "realtime.command",
 }
 """Modules of commands that are not named after them."""
 _OF_POSIX = ("fcntl", "resource")

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import click
 
-from faintspot.slopes.estimators.documentation import allowed_in_words, needs_in_words
-from faintspot.slopes.estimators.registry import estimator_named, estimators
+from faintspot.slopes.estimators.registry import allowed_in_words, estimator_named, estimators, needs_in_words
 
 
 @click.command()

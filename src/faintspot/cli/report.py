@@ -61,7 +61,7 @@ def command(slopes: tuple[str, ...], output: str | None, recording: tuple[str, .
         report = loop_page(MagnitudeResult.load(paths[0] / MAGNITUDE_FILE))
         target = target if output is not None else paths[0] / "report.html"
     elif len(paths) == 1 and kind_of_store(paths[0]) == "study":
-        from faintspot.experiments.report.page import report_of_study
+        from faintspot.experiments.report import report_of_study
 
         report = report_of_study(paths[0])
     elif len(paths) == 1 and holds_telemetry(paths[0]):

@@ -105,7 +105,7 @@ def _repeat_the_paper(target: str, quick: bool, figures: tuple[str, ...], where:
     require("loop", "matplotlib", "jinja2", "hcipy", purpose="faintspot study paper")
     from faintspot.experiments.night.page import PAGE_FILE
     from faintspot.experiments.paper.whole import paper_markdown, paper_rows
-    from faintspot.experiments.report.page import night_folder
+    from faintspot.experiments.report import night_folder
     from faintspot.experiments.study.specification import FIGURES, NIGHT, paper_study
     from faintspot.loop.simulation.configuration.configuration import load_loop
 
@@ -143,7 +143,7 @@ def _map_the_loop(
 
 def _write_page(dataset: xarray.Dataset, target: str, night: Night | None = None) -> None:
     """Write the page of a study beside its store."""
-    from faintspot.experiments.report.page import study_report
+    from faintspot.experiments.report import study_report
 
     page = derived(target, ".html")
     study_report(dataset, night).write(page)

@@ -58,7 +58,6 @@ _SECTIONS = {"camera": "Camera", "spot": "Spots", "star": "Guide star", "tune": 
 @declared(Question, sections=_SECTIONS)
 @option("--output", "-o", metavar="TOML", default="faintspot.toml", help="Configuration to write.")
 @option("--picture", metavar="PNG", help="Plot to write.", show_default="beside the output, with -tune.png")
-@option("--seed", type=click.IntRange(0), default=1, help="Seed of the simulation.")
 @option("--overwrite", is_flag=True, help="Replace the settings of an existing configuration.")
 def command(
     recording: tuple[str, ...],
@@ -68,7 +67,6 @@ def command(
     config: str | None,
     output: str,
     picture: str | None,
-    seed: int,
     overwrite: bool,
     **options: object,
 ) -> None:
@@ -103,7 +101,7 @@ def command(
         question = _question(recording, dark, key, given, opened)
         from faintspot.experiments.planner.tuning import tune
 
-        answer = tune(question, rng=np.random.default_rng(seed), progress=advance)
+        answer = tune(question, rng=np.random.default_rng(1), progress=advance)
     console = Console(highlight=False)
     if factor > 1:
         click.echo(f"{factor} x {factor} pixels are summed: px here are those of binned frames")
@@ -250,7 +248,7 @@ def _say_what_is_next(answer: Answer, target: Path, picture: Path | None, frames
     """Write the picture, and say what comes next."""
     click.echo(f"{target}: written")
     if picture is not None:
-        from faintspot.experiments.planner.figures import tune_figure
+        from faintspot.experiments.planner.text import tune_figure
 
         write_picture(tune_figure(answer), picture)
     if answer.question.layout is None:

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 import numpy as np
 
 from faintspot.base.errors import InputError
 from faintspot.base.files import derived
+from faintspot.base.report.plots import METHOD_COLOURS, Line, Panel, plot
 from faintspot.cli.shared.commands import SectionedCommand, declared, errors_of_options, option
 from faintspot.cli.shared.needs import can_make
 from faintspot.cli.shared.output import picture_file, write_picture
@@ -20,8 +21,12 @@ from faintspot.slopes.pipeline.slopes import Slopes
 from faintspot.slopes.recorded.stored_run import difference, open_run
 from faintspot.slopes.sensor.layout import OPTICS, Layout
 from faintspot.slopes.wavefront import Wavefront, fit_wavefront, save_wavefront
+from faintspot.slopes.wavefront.figure import wavefront_map
 from faintspot.slopes.wavefront.files import check_wavefront_file, mode_table, remarks, rms_table
-from faintspot.slopes.wavefront.fit import UNITS, total
+from faintspot.slopes.wavefront.fit import NM, total
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 
 @click.command(cls=SectionedCommand)
@@ -36,8 +41,6 @@ from faintspot.slopes.wavefront.fit import UNITS, total
     show_default="by the sensor",
 )
 @option("--minus", metavar="SLOPES", help="Slopes of a recording whose mean wavefront is subtracted.")
-@option("--unit", type=click.Choice(UNITS), help="Unit of the wavefront.", show_default="nm, if known")
-@option("--wavelength-nm", type=float, metavar="NM", help="Wavelength, for waves.")
 @option(
     "--actuators",
     metavar="FILE",
@@ -60,8 +63,6 @@ def command(
     picture: str | None,
     modes: int | None,
     minus: str | None,
-    unit: str | None,
-    wavelength_nm: float | None,
     actuators: str | None,
     stroke: float | None,
     command_file: str | None,
@@ -102,9 +103,6 @@ def command(
     if other is not None:
         with errors_of_options(minus):
             wavefront = _with_error_of(other, layout, wavefront)
-    with errors_of_options(slopes):
-        if unit or wavelength_nm is not None:
-            wavefront = wavefront.in_unit(unit or "nm", wavelength_nm)
     with errors_of_options(actuators):
         flat = None if interaction is None else flattening(measured, interaction, stroke)
     # A difference of positions in the frame lacks nothing.
@@ -135,8 +133,6 @@ def _write_flattening(
     moved_x, moved_y = flat.slopes_px.reshape(2, -1).astype(np.float32)
     left = replace(measured, x=measured.x + moved_x, y=measured.y + moved_y)
     after = fit_wavefront(left, layout, modes=len(wavefront.modes))
-    if wavefront.unit != after.unit:
-        after = after.in_unit(wavefront.unit, wavefront.wavelength_nm)
     before, left_over = (f"{total(part.mean):.3g}" for part in (wavefront, after))
     click.echo()
     for line in flat.remarks():
@@ -147,8 +143,6 @@ def _write_flattening(
     save_command(target, flat.command)
     click.echo(f"command: {target}")
     if can_make("picture", "report", "matplotlib"):
-        from faintspot.loop.control.flattening_figure import flattening_figure
-
         write_picture(flattening_figure(flat, wavefront, after, layout), target.with_suffix(".png"))
 
 
@@ -162,7 +156,7 @@ def _print(wavefront: Wavefront, notes: list[str]) -> None:
         words = 2 if header[0] == "Noll" else 1
         for place, title in enumerate(header):
             text = place < words
-            kept = text and wavefront.unit in UNITS  # the unit of pixels needs the space
+            kept = text and wavefront.unit == NM  # the unit of pixels needs the space
             table.add_column(title, justify="left" if text else "right", no_wrap=kept)
         for row in rows:
             table.add_row(*row)
@@ -170,3 +164,27 @@ def _print(wavefront: Wavefront, notes: list[str]) -> None:
         console.print()
     for line in (*remarks(wavefront), *notes):
         click.echo(line)
+
+
+def flattening_figure(flat: Flattening, before: Wavefront, after: Wavefront, layout: Layout) -> Figure:
+    """Draw the wavefront before and after the command, and the command of each actuator.
+
+    Parameters
+    ----------
+    flat : Flattening
+    before, after : Wavefront
+        Fits to the slopes, and to the slopes with those of the command.
+    layout : Layout
+    """
+    largest = float(np.nanmax(np.abs(before.sheet())))
+    cases = {"measured": before, "with the command": after}
+    maps = [wavefront_map(wavefront, layout, when, largest=largest) for when, wavefront in cases.items()]
+    style = {"color": METHOD_COLOURS[1], "drawstyle": "steps-mid", "marker": ".", "lw": 1}
+    limits = [] if flat.stroke is None else [-flat.stroke, flat.stroke]
+    levels = {0.0: {}, **{limit: {"ls": "--", "label": "stroke limit"} for limit in limits}}
+    line, unit = (
+        Line("command", np.arange(len(flat.command)), flat.command, style=style),
+        "interaction matrix",
+    )
+    panel = Panel([line], "actuator", f"command (unit of the {unit})", levels=levels, share=2)
+    return plot([maps, [panel]], 9.6, heading="Command that would flatten the mean wavefront")

@@ -12,7 +12,6 @@ import numpy as np
 
 from faintspot.base.errors import InputError
 from faintspot.engine.loop.control_loop import CLOSED, OPEN, STATES, ControlLoop
-from faintspot.engine.options import EngineOptions, FrameInput
 from faintspot.engine.path.frame_path import FramePath
 from faintspot.engine.path.timing import INCOMPLETE, WORKER, FrameAccount
 from faintspot.engine.path.workers import SlopePrior, Workers
@@ -20,7 +19,7 @@ from faintspot.engine.pixels.pixel_ring import PixelRing, living_ring
 from faintspot.engine.settings.estimators import EngineEstimators
 from faintspot.engine.settings.following import DarkFollower, FluxFollower
 from faintspot.engine.settings.interleaving import EVERY, FIRST_METHOD, METHODS, Interleaving
-from faintspot.engine.settings.plan import EnginePlan, SettingsPreparer
+from faintspot.engine.settings.plan import EngineOptions, EnginePlan, FrameInput, SettingsPreparer
 from faintspot.engine.settings.running_settings import Change, RunningSettings
 from faintspot.engine.streams.slope_streams import SlopeStreams
 from faintspot.engine.telemetry.ring import TelemetryRing

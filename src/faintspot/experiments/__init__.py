@@ -9,11 +9,11 @@ from faintspot.base.extras import lazy_attributes
 if TYPE_CHECKING:
     from faintspot.experiments.closed_loop.magnitude import run_magnitude as run_magnitude
     from faintspot.experiments.planner.answer import Answer as Answer
-    from faintspot.experiments.planner.figures import tune_figure as tune_figure
     from faintspot.experiments.planner.promise import Promise as Promise
     from faintspot.experiments.planner.promise import check_promises as check_promises
     from faintspot.experiments.planner.question import Question as Question
     from faintspot.experiments.planner.recorded import question_from_frames as question_from_frames
+    from faintspot.experiments.planner.text import tune_figure as tune_figure
     from faintspot.experiments.planner.tuning import tune as tune
     from faintspot.experiments.running import WorkerPool as WorkerPool
     from faintspot.experiments.study.cell import measure_cell as measure_cell
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 _NAMES = {
     "planner.answer": "Answer",
-    "planner.figures": "tune_figure",
+    "planner.text": "tune_figure",
     "study.cell": "measure_cell",
     "closed_loop.magnitude": "run_magnitude",
     "planner.promise": "Promise check_promises",

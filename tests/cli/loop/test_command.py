@@ -7,8 +7,8 @@ from tests.cli.cli_cases import Commands
 from tests.experiments.experiment_cases import SEARCH, small
 from tests.experiments.result_cases import made_up_magnitude
 
-from faintspot.cli.loop import command
-from faintspot.experiments.closed_loop import experiment, magnitude
+from faintspot.cli import loop as command
+from faintspot.experiments.closed_loop import magnitude
 from faintspot.experiments.closed_loop.results import MagnitudeResult
 from faintspot.experiments.night import page, protocol
 from faintspot.experiments.night.blocks import load_night
@@ -25,7 +25,7 @@ pytestmark = pytest.mark.slow
 
 @pytest.fixture(autouse=True)
 def _small_experiments(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr(experiment, "QUICK", SEARCH)
+    monkeypatch.setattr(magnitude, "QUICK", SEARCH)
     monkeypatch.chdir(tmp_path)
     faint = small().replace("camera", em_gain=100.0).replace("run", photons_per_subaperture=(40.0, 400.0))
     Path("small.toml").write_text(faint.to_text(), encoding="utf-8")

@@ -11,7 +11,7 @@ from tests.loop.control.control_cases import FRAME_S, INTERACTION, LAYERS, PLANT
 from tests.patience import wait_for
 
 from faintspot.base.errors import InputError
-from faintspot.engine.background.background_process import BackgroundLearning, _watch, background_learning
+from faintspot.engine.background import BackgroundLearning, _watch, background_learning
 from faintspot.engine.loop.control_loop import ControlLoop
 from faintspot.engine.request_handlers import commands_of
 from faintspot.engine.requests.requests import ControlServer, socket_path
@@ -142,8 +142,8 @@ def test_a_better_filter_is_handed_to_the_engine(
         assert any(np.allclose(found, slopes - slopes.mean(axis=0), atol=1e-3) for slopes in rows)
         return RelearntControl(model, 1.0, 1.0 if running is model else 2.0, 3.0, 0.1)
 
-    monkeypatch.setattr("faintspot.engine.background.background_process.relearn", relearnt)
-    monkeypatch.setattr("faintspot.engine.background.background_process.FEWEST_FRAMES", 90)
+    monkeypatch.setattr("faintspot.engine.background.relearn", relearnt)
+    monkeypatch.setattr("faintspot.engine.background.FEWEST_FRAMES", 90)
     path = tmp_path / "faintspot.toml"
     configuration_file.save(path, LAYOUT)
     configuration_file.save(path, Settings("brightest"))
@@ -195,7 +195,7 @@ def test_it_never_learns_across_records_that_were_lost(
     name: str, model: Kalman, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Frames before and after a gap are no time series: what waits is forgotten, and it begins anew."""
-    monkeypatch.setattr("faintspot.engine.background.background_process.FEWEST_FRAMES", 90)
+    monkeypatch.setattr("faintspot.engine.background.FEWEST_FRAMES", 90)
     path = tmp_path / "faintspot.toml"
     configuration_file.save(path, LAYOUT)
     np.save(tmp_path / "m.npy", INTERACTION)

@@ -9,7 +9,7 @@ from tests.engine.telemetry_cases import LAYOUT, as_written, write, write_images
 from faintspot.engine.page.engine_source import EngineSource
 from faintspot.engine.streams.shared_streams import create_stream
 from faintspot.engine.telemetry.ring import TelemetryRing
-from faintspot.engine.telescope.simulated_telescope import TRUTH
+from faintspot.engine.telescope import TRUTH
 
 
 def test_engine_that_comes_goes_and_comes_back(name: str, monkeypatch: pytest.MonkeyPatch) -> None:

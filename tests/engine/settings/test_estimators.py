@@ -11,7 +11,7 @@ from tests.engine.bench import SETTINGS, Bench, make, simulated
 from tests.engine.estimator_files import PEAK, write
 
 import faintspot as fs
-from faintspot.cli.realtime.command import command
+from faintspot.cli.realtime import command
 from faintspot.engine.request_handlers import commands_of
 from faintspot.engine.requests.requests import ControlServer, socket_path
 from faintspot.engine.settings.estimators import EstimatorTrial, load_estimators

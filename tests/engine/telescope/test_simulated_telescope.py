@@ -32,7 +32,7 @@ from faintspot.cli.realtime.control import status as show_status
 from faintspot.engine.pixels.pixel_ring import PixelRing
 from faintspot.engine.pixels.segment import FOLDER
 from faintspot.engine.requests.requests import TELESCOPE, ControlServer, request, socket_path
-from faintspot.engine.telescope.simulated_telescope import (
+from faintspot.engine.telescope import (
     TRUTH,
     ObservingConditions,
     SimulatedTelescope,

@@ -13,8 +13,7 @@ from tests.experiments.experiment_cases import (
 )
 
 from faintspot.base.errors import InputError
-from faintspot.experiments.closed_loop.experiment import quick_run
-from faintspot.experiments.closed_loop.magnitude import run_magnitude
+from faintspot.experiments.closed_loop.magnitude import quick_run, run_magnitude
 from faintspot.experiments.closed_loop.results import MagnitudeResult
 from faintspot.experiments.running import WorkerPool
 from faintspot.loop.simulation.record import MAGNITUDE_FILE

@@ -10,7 +10,7 @@ from faintspot import Calibration, InputError, Layout, SlopePipeline
 from faintspot.base.statistics import slope_error
 from faintspot.experiments.planner import text as answer_text
 from faintspot.experiments.planner.answer import Answer
-from faintspot.experiments.planner.figures import tune_figure
+from faintspot.experiments.planner.text import tune_figure
 from faintspot.slopes.estimators import estimators
 from faintspot.slopes.simulate import Detector
 

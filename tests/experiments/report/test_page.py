@@ -10,7 +10,7 @@ import pytest
 from tests.experiments.study_cases import dataset, power_law
 
 from faintspot.base.errors import InputError
-from faintspot.experiments.report.page import report_of_study, study_report
+from faintspot.experiments.report import report_of_study, study_report
 from faintspot.experiments.study.specification import StudySpecification, paper_study
 from faintspot.experiments.study.sweep import Sweep
 

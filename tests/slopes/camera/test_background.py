@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from faintspot.slopes.camera.background import smooth_background, varies
+from faintspot.slopes.camera.frame_checks import smooth_background, varies
 
 SIDE, PITCH_PX, SPOT_PX, FLUX, NOISE = 200, 20.0, 1.5, 1000.0, 2.0
 ROW, COLUMN = np.mgrid[:SIDE, :SIDE]

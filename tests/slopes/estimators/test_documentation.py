@@ -2,7 +2,7 @@
 
 from tests.shared_data import ROOT
 
-from faintspot.slopes.estimators.documentation import all_tables
+from faintspot.slopes.estimators.registry import all_tables
 from faintspot.slopes.pipeline.settings import SharedOptions
 
 PAGE = ROOT / "docs" / "configuration.md"

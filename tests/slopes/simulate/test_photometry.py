@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from faintspot.base.errors import InputError
-from faintspot.slopes.simulate.frames import ZERO_POINTS, Photometry
+from faintspot.slopes.simulate.photometry import ZERO_POINTS, Photometry
 
 FLUX = Photometry(area_m2=0.36, frame_time_s=0.004)
 

@@ -15,9 +15,9 @@ from faintspot.cli.layout import options as layout_options
 from faintspot.cli.layout.options import is_number, plain
 from faintspot.cli.shared.commands import errors_of_options, flag_of
 from faintspot.io.frames import open_frames
-from faintspot.slopes.camera.background import overlap, smooth_background, varies
 from faintspot.slopes.camera.calibration import Calibration
 from faintspot.slopes.camera.dark_frames import FEWEST_FRAMES, DarkPixels
+from faintspot.slopes.camera.frame_checks import overlap, smooth_background, varies
 from faintspot.slopes.camera.photon_transfer import measure_detector
 from faintspot.slopes.sensor.found_layout import FoundLayout, KnownGrid, find_illuminated
 from faintspot.slopes.sensor.layout import Layout

@@ -11,9 +11,15 @@ from faintspot.base.config.tables import parse_changes
 from faintspot.base.errors import InputError
 from faintspot.base.json_text import to_json
 from faintspot.base.toml_files import check_keys
-from faintspot.cli.realtime.stopping import stop_on_signal
 from faintspot.cli.shared.commands import ENGINE_NAME, RANGES, option
-from faintspot.cli.shared.engine_requests import asked, asked_at_length, loop_in_words, notes, summary
+from faintspot.cli.shared.engine_requests import (
+    asked,
+    asked_at_length,
+    loop_in_words,
+    notes,
+    stop_on_signal,
+    summary,
+)
 from faintspot.engine.requests.requests import ENGINE, TELESCOPE, since
 
 _REFRESH_S = 0.5

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 import click
 from rich.console import Console
 
-from faintspot.cli.realtime.stopping import stop_on_signal
 from faintspot.cli.shared.commands import PORT, name_option, option
+from faintspot.cli.shared.engine_requests import stop_on_signal
 from faintspot.cli.shared.needs import needs
 from faintspot.cli.shared.output import results_table
 

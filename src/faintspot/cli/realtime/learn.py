@@ -76,7 +76,7 @@ def learn(
 def _learn_repeatedly(name: str, config: str, every_s: float) -> None:
     """Learn from a running engine again and again."""
     require_linux("realtime learn --every")
-    from faintspot.engine.background.background_process import BackgroundLearning
+    from faintspot.engine.background import BackgroundLearning
 
     BackgroundLearning(name, config, every_s).run(click.echo)
 

@@ -50,7 +50,7 @@ def command(recording: Path | None, name: str, bind: str, port: int, private: bo
       faintspot live
       faintspot live night.zarr
     """
-    from faintspot.cli.realtime.stopping import stop_on_signal
+    from faintspot.cli.shared.engine_requests import stop_on_signal
     from faintspot.engine.page.server import serve
 
     if recording is None:

@@ -8,10 +8,8 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from faintspot.base.errors import InputError
-from faintspot.base.extras import require
-from faintspot.cli.shared.commands import AO_MODE, ENGINE_NAME, option
+from faintspot.cli.shared.commands import ENGINE_NAME, option
 from faintspot.cli.shared.needs import needs
-from faintspot.cli.shared.output import write_aot_file
 
 if TYPE_CHECKING:
     from faintspot.engine.telemetry.recorder import RecordingReport
@@ -23,34 +21,25 @@ if TYPE_CHECKING:
 @ENGINE_NAME
 @option("--frames", type=click.IntRange(1), help="Stop after so many.")
 @option("--seconds", type=click.FloatRange(0, min_open=True), help="Stop after so long.")
-@AO_MODE
-def record(out: Path, name: str, frames: int | None, seconds: float | None, ao_mode: str) -> None:
+def record(out: Path, name: str, frames: int | None, seconds: float | None) -> None:
     """Record slopes, fluxes, times, images and changes of settings of a running engine until Ctrl-C.
 
-    OUT is a Zarr store (.zarr), which grows as frames come and is whole at any time, or an AOT file (.fits),
-    which is written at the end from the store of the same name beside it. The engine never waits: where
-    reading or the disk is too slow, frames are lost to the record, and counted.
+    OUT is a Zarr store (.zarr), which grows as frames come and is whole at any time; `faintspot export` makes
+    an AOT file of it. The engine never waits: where reading or the disk is too slow, frames are lost to the
+    record, and counted.
 
     \b
     Example:
       faintspot realtime record night.zarr --seconds 60
     """
-    if out.suffix not in (".zarr", ".fits"):
-        raise InputError(f"{out}: expected a name that ends in .zarr or .fits")
-    if out.suffix == ".fits" and out.exists():
-        raise InputError(f"{out}: already exists; choose another name")
-    if out.suffix == ".fits":
-        require("realtime", "aotpy", purpose="Writing an AOT file")
-    store = out.with_suffix(".zarr")
-    report = record_engine(name, store, frames, seconds)
-    click.echo(f"{store}: {summary(report)}")
-    if out.suffix == ".fits" and report.frames:
-        write_aot_file(store, out, ao_mode)
+    if out.suffix != ".zarr":
+        raise InputError(f"{out}: expected a name that ends in .zarr")
+    click.echo(f"{out}: {summary(record_engine(name, out, frames, seconds))}")
 
 
 def record_engine(name: str, store: Path, frames: int | None, seconds: float | None) -> RecordingReport:
     """Record a running engine to a new store, with a progress bar, until a limit or Ctrl-C."""
-    from faintspot.cli.realtime.stopping import stop_on_signal
+    from faintspot.cli.shared.engine_requests import stop_on_signal
     from faintspot.cli.shared.progress import progress_bar
     from faintspot.engine.telemetry.recorder import Recorder
 

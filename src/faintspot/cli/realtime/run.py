@@ -11,9 +11,8 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from faintspot.cli.realtime.live import page_beside
-from faintspot.cli.realtime.stopping import stop_on_signal
 from faintspot.cli.shared.commands import FRAMES, RANGES, configuration_option, name_option, option
-from faintspot.cli.shared.engine_requests import summary
+from faintspot.cli.shared.engine_requests import stop_on_signal, summary
 from faintspot.cli.shared.needs import needs
 from faintspot.engine.requests.requests import socket_path
 
@@ -103,12 +102,12 @@ def run(
     """
     from faintspot.base.errors import InputError
     from faintspot.engine.engine import Engine
-    from faintspot.engine.options import EngineOptions
     from faintspot.engine.path.workers import PipelineMaker
     from faintspot.engine.request_handlers import LENGTHY, commands_of
     from faintspot.engine.requests.child_processes import real_time
     from faintspot.engine.requests.requests import ControlServer
     from faintspot.engine.settings.interleaving import Interleaving
+    from faintspot.engine.settings.plan import EngineOptions
     from faintspot.loop.control.configuration import load_control
     from faintspot.slopes.pipeline.configuration import Configuration
 
@@ -164,7 +163,7 @@ def _learning(engine: Engine, config: str) -> AbstractContextManager[None]:
     options = None if engine.loop is None else engine.loop.control.options
     if options is None or options.controller != KALMAN or not options.learn_every_s:
         return nullcontext()
-    from faintspot.engine.background.background_process import background_learning
+    from faintspot.engine.background import background_learning
 
     return background_learning(engine, config, options.learn_every_s, partial(click.echo, err=True))
 

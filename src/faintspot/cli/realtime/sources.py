@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from faintspot.base.errors import InputError
-from faintspot.cli.realtime.stopping import published, stop_on_signal
 from faintspot.cli.shared.commands import FRAMES, KEY, SLOTS, name_option, option
+from faintspot.cli.shared.engine_requests import published, stop_on_signal
 from faintspot.cli.shared.needs import needs
 from faintspot.cli.shared.progress import progress_bar
 

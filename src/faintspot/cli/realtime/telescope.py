@@ -10,8 +10,8 @@ from typing import Any, Self
 import click
 
 from faintspot.base.files import output_errors
-from faintspot.cli.realtime.stopping import published, stop_on_signal
 from faintspot.cli.shared.commands import FRAMES, READOUT_FRACTION, SLOTS, name_option, option
+from faintspot.cli.shared.engine_requests import published, stop_on_signal
 from faintspot.engine.requests.requests import TELESCOPE, socket_path
 
 
@@ -83,7 +83,7 @@ def telescope(
     """
     from faintspot.engine.requests.child_processes import real_time
     from faintspot.engine.requests.requests import ControlServer
-    from faintspot.engine.telescope.simulated_telescope import LENGTHY, SimulatedTelescope, commands_of
+    from faintspot.engine.telescope import LENGTHY, SimulatedTelescope, commands_of
     from faintspot.loop.simulation.configuration.configuration import load_loop
     from faintspot.loop.simulation.engine_files import write_engine_files
 

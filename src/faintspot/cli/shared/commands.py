@@ -225,9 +225,3 @@ REFERENCE = option(
     metavar="FILE",
     help="Reference positions: slopes of a flat wavefront (their mean), or (n, 2) px as FILE[:ARRAY].",
 )
-AO_MODE = option(
-    "--ao-mode",
-    type=click.Choice(["SCAO", "SLAO", "GLAO", "MOAO", "LTAO", "MCAO"]),
-    default="SCAO",
-    help="What an AOT file says the sensor serves.",
-)

@@ -60,20 +60,3 @@ def write_picture(figure: Any, path: Path) -> None:
 
     write_atomically(path, png(figure))
     click.echo(f"picture: {path}")
-
-
-def write_aot_file(store: Path, out: Path, ao_mode: str) -> None:
-    """Write recorded telemetry as an AOT file.
-
-    Raises
-    ------
-    InputError
-        If the name does not end in .fits.
-    """
-    from faintspot.io import read_telemetry, write_aot
-
-    if out.suffix != ".fits":
-        raise InputError(f"{out}: expected a name that ends in .fits")
-    telemetry = read_telemetry(store)
-    write_aot(out, telemetry, ao_mode=ao_mode)
-    click.echo(f"{out}: {len(telemetry.frame)} frames, {len(telemetry.image_frame)} images")

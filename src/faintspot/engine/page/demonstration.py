@@ -22,7 +22,7 @@ from faintspot.engine.settings.interleaving import short_names
 from faintspot.engine.streams.stream import Follower
 from faintspot.engine.telemetry.numbers import MethodDifference, compared_methods
 from faintspot.engine.telemetry.ring import TelemetryRing
-from faintspot.engine.telescope.simulated_telescope import TRUTH
+from faintspot.engine.telescope import TRUTH
 from faintspot.loop.control.base import KALMAN
 from faintspot.loop.control.configuration import save_control
 from faintspot.loop.control.options import TABLE

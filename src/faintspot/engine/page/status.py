@@ -8,8 +8,7 @@ from typing import Any
 
 from faintspot.base.errors import InputError
 from faintspot.engine.requests.requests import request, socket_path
-from faintspot.slopes.estimators.documentation import allowed_in_words
-from faintspot.slopes.estimators.registry import estimators
+from faintspot.slopes.estimators.registry import allowed_in_words, estimators
 from faintspot.slopes.pipeline.settings import SharedOptions
 
 _EVERY_S = 0.5

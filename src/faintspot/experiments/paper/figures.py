@@ -13,7 +13,7 @@ from faintspot.base.report.plots import METHOD_COLOURS, WIDTH, Line, Panel, Pict
 from faintspot.base.report.texts import Texts
 from faintspot.experiments.methods import NO_TV, TV, knows_the_spot, label_of, style_of
 from faintspot.experiments.paper.claims import fixed_mode
-from faintspot.experiments.paper.tables import (
+from faintspot.experiments.paper.whole import (
     grouped,
     in_words,
     mode_in_words,

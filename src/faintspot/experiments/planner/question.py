@@ -18,7 +18,7 @@ from faintspot.experiments.planner.stated import Spots, StatedCamera, StatedOpti
 from faintspot.slopes.camera.calibration import Calibration
 from faintspot.slopes.estimators.scene import Scene
 from faintspot.slopes.sensor.layout import Layout
-from faintspot.slopes.simulate.frames import Photometry, StarLight
+from faintspot.slopes.simulate.photometry import Photometry, StarLight
 from faintspot.slopes.spots.laser_spots import LaserSpots
 from faintspot.slopes.spots.psf import PSF
 

@@ -1,5 +1,5 @@
 """Camera: `calibration`, `detector`, and their measurement.
 
-`dark_frames`, `photon_transfer` and `transfer_curve` measure the detector; `frame_checks` and `background`
-look at frames of spots.
+`dark_frames`, `photon_transfer` and `transfer_curve` measure the detector; `frame_checks` looks at
+frames of spots.
 """

@@ -23,9 +23,8 @@ from faintspot.slopes.pipeline.light import MeanLight
 from faintspot.slopes.pipeline.settings import Settings
 from faintspot.slopes.pipeline.slope_pipeline import SlopePipeline
 from faintspot.slopes.pipeline.slopes import Slopes
-from faintspot.slopes.sensor.detection.acquisition import Acquired, acquire
-from faintspot.slopes.sensor.detection.following import FollowedDrift
-from faintspot.slopes.sensor.detection.lattice import Lattice
+from faintspot.slopes.sensor.detection.acquisition import Acquired, FollowedDrift, acquire
+from faintspot.slopes.sensor.detection.candidates import Lattice
 from faintspot.slopes.sensor.detection.nodes import find_spots, spot_width
 from faintspot.slopes.sensor.layout import Layout
 from faintspot.slopes.sensor.region import as_rows, neighbours_of

@@ -10,7 +10,7 @@ import numpy as np
 from faintspot.base.files import check_ending, write_atomically
 from faintspot.base.json_text import to_json
 from faintspot.base.report.texts import Texts, number_or_dash, signed
-from faintspot.slopes.wavefront.fit import UNITS, Floats, Wavefront, total
+from faintspot.slopes.wavefront.fit import NM, Floats, Wavefront, total
 from faintspot.slopes.wavefront.zernike import mode_name, noll_to_nm, osa_index
 
 _TEXT = Texts("faintspot.slopes.wavefront")
@@ -81,8 +81,7 @@ def remarks(wavefront: Wavefront) -> list[str]:
         last=wavefront.modes[-1],
         diameter=2 * pupil.radius_subapertures,
         size=size + (" around those with flux" if pupil.part else ""),
-        in_pixels=wavefront.unit not in UNITS,
-        in_waves=wavefront.unit == "waves",
+        in_pixels=wavefront.unit != NM,
         has_errors=wavefront.errors_from == "slopes",
         without=wavefront.left_out.capitalize() or None,
         several=fitted > 1,
@@ -164,5 +163,4 @@ def _values(wavefront: Wavefront) -> dict[str, Any]:
         unknown["frames"] = "too few valid sub-apertures to separate the modes"
     elif not np.isfinite(wavefront.standard_errors).all():
         unknown["standard_errors"] = "no standard errors of the slopes, and no residuals to replace them"
-    wave = {} if wavefront.wavelength_nm is None else {"wavelength_nm": wavefront.wavelength_nm}
-    return {**values, **wave, "unknown": unknown}
+    return {**values, "unknown": unknown}

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.base.checks import number_between, one_of
+from faintspot.base.checks import number_between
 from faintspot.base.errors import InputError
 from faintspot.base.flags import leave_out
 from faintspot.slopes.pipeline.slopes import Slopes
@@ -17,8 +17,8 @@ from faintspot.slopes.wavefront.zernike import mean_gradients, zernike
 
 Floats = NDArray[np.float64]
 
-UNITS = "nm", "um", "waves"
-"""Units of length for wavefronts."""
+NM = "nm"
+"""Unit of wavefronts where the layout tells the angle of a pixel and the size of the pupil."""
 _POINTS = 201  # of a map along the diameter of the pupil
 _NM_PER_ARCSEC_M = 1e9 * np.pi / (180 * 3600)
 LARGEST_CONDITION = 100.0
@@ -51,62 +51,13 @@ class Wavefront:
     other_standard_error: Floats | None = None
     """Standard error of a mean wavefront that was subtracted, (k,)."""
     unit: str
-    """Unit: one of `UNITS`, or "px × sub-aperture" (slopes in pixels, lengths in sub-apertures)."""
+    """Unit: "nm", or "px × sub-aperture" (slopes in pixels, lengths in sub-apertures)."""
     pupil: Pupil
     errors_from: str
     """Source of the standard errors: those of the slopes ("slopes"), or the slopes' scatter about the fit
     ("residuals"), which counts as noise what is not fitted."""
     left_out: str = ""
     """Line about the slopes that were left out; empty if there are none."""
-    wavelength_nm: float | None = None
-    """Length of a wave, for the unit "waves"."""
-
-    def in_unit(self, unit: str, wavelength_nm: float | None = None) -> Wavefront:
-        """Return the wavefront in another unit.
-
-        Parameters
-        ----------
-        unit : {"nm", "um", "waves"}
-        wavelength_nm : float, optional
-            Required for waves, and only for them.
-
-        Raises
-        ------
-        InputError
-            If the wavefront is in pixels, or wavelength and unit do not fit.
-        """
-        one_of("unit", unit, UNITS)
-        if (unit == "waves") != (wavelength_nm is not None):
-            raise InputError("wavelength_nm: expected a wavelength for the unit waves, and for no other")
-        if wavelength_nm is not None:
-            wavelength_nm = number_between("wavelength_nm", wavelength_nm, 0, low_open=True)
-        converted = replace(self, unit=unit, wavelength_nm=wavelength_nm)
-        factor = self.nm_per_unit / converted.nm_per_unit
-        other = self.other_standard_error
-        return replace(
-            converted,
-            coefficients=factor * self.coefficients,
-            standard_errors=factor * self.standard_errors,
-            other_standard_error=None if other is None else factor * other,
-        )
-
-    @property
-    def nm_per_unit(self) -> float:
-        """Length of the unit [nm].
-
-        Raises
-        ------
-        InputError
-            If the wavefront is in pixels.
-        """
-        lengths = {"nm": 1.0, "um": 1e3, "waves": self.wavelength_nm}
-        length = lengths.get(self.unit)
-        if length is None:
-            raise InputError(
-                "layout: expected pixel_scale_arcsec, and subaperture_m or diameter_m, for a wavefront in a "
-                "unit of length"
-            )
-        return length
 
     @property
     def fitted(self) -> NDArray[np.bool_]:
@@ -246,7 +197,7 @@ def _unit_of(layout: Layout, pupil: Pupil) -> tuple[str, float]:
     """Return the unit of coefficients, and its value for one pixel times the disk's radius."""
     if layout.pixel_scale_arcsec is None or pupil.radius_m is None:
         return "px × sub-aperture", pupil.radius_subapertures
-    return "nm", layout.pixel_scale_arcsec * pupil.radius_m * _NM_PER_ARCSEC_M
+    return NM, layout.pixel_scale_arcsec * pupil.radius_m * _NM_PER_ARCSEC_M
 
 
 def _too_few(valid: NDArray[np.bool_], left_out: str) -> InputError:

@@ -31,7 +31,7 @@ from faintspot.loop.simulation.configuration.sections import (
 )
 from faintspot.loop.turbulence.slope_covariance import ARCSEC
 from faintspot.slopes.estimators.scene import Scene
-from faintspot.slopes.simulate.frames import Photometry
+from faintspot.slopes.simulate.photometry import Photometry
 from faintspot.slopes.spots.von_karman import R0_WAVELENGTH_M
 
 """Radians in one arcsecond."""

@@ -12,7 +12,7 @@ from faintspot.base.config.options import FLAG, LIST, NUMBER_OR_LIST, number, se
 from faintspot.base.config.tables import ConfigurationTable
 from faintspot.base.errors import InputError
 from faintspot.loop.control.base import LEARNT, WINDS
-from faintspot.slopes.simulate.frames import StarLight
+from faintspot.slopes.simulate.photometry import StarLight
 from faintspot.slopes.spots.sodium import SodiumProfile, integration_points
 
 CLOSED, OPEN = "closed", "open"

@@ -30,10 +30,10 @@ from faintspot.slopes.kernels.gravity.smoothing import (
     without_noisy_pixels,
 )
 from faintspot.slopes.kernels.spot_fits import spot_rows
-from faintspot.slopes.kernels.spot_fits.background import subtract_background
 from faintspot.slopes.kernels.spot_fits.likelihood import fit_group
 from faintspot.slopes.kernels.spot_fits.posterior import posterior_of_group
 from faintspot.slopes.kernels.spot_fits.profiles import LEAST_FLUX_E, find_start
+from faintspot.slopes.kernels.spot_fits.spot_rows import subtract_background
 from faintspot.slopes.kernels.spot_fits.weighted import weigh_group
 
 # Rows of the settings' table that follow the common ones: flux that is expected; weights of a fit; prior.

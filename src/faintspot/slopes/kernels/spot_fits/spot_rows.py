@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from typing import Any
 
-from faintspot.slopes.kernels.compilation.compiling import inlined
+from faintspot.slopes.kernels.compilation.compiling import compiled, inlined
 from faintspot.slopes.kernels.compilation.simd import (
     load,
     maximum,
     multiply_add,
     reciprocal,
+    select,
     splat,
+    store,
     width_of,
 )
 from faintspot.slopes.kernels.gravity.smoothing import variance_of, weight_variance_of
@@ -75,3 +77,75 @@ def weigh(lanes: Any, noise: Any, variances: Any, at: Any, m: Any) -> Any:
     own = weight_variance_of(lanes, variances, at, v, wv)
     w = reciprocal(multiply_add(expected, multiply_add(expected, model_error, we), own))
     return w, w * multiply_add(expected, e, variance_of(lanes, variances, at, v))
+
+
+_LEAST_LEFT = 1e-5  # of the information on the flux: below it is round-off, and the spot resembles a constant
+
+
+@compiled
+def subtract_background(lanes: Any, image: Any, pixels: Any, flux: Any) -> None:
+    """Subtract from every lane's image the constant that leaves it `flux` (a vector, electrons)."""
+    width = width_of(lanes)
+    even, odd = splat(lanes, 0.0), splat(lanes, 0.0)  # neither addition waits for the other
+    for i in range(0, pixels - 1, 2):
+        even = even + load(lanes, image, i * width)
+        odd = odd + load(lanes, image, (i + 1) * width)
+    if pixels % 2 == 1:
+        even = even + load(lanes, image, (pixels - 1) * width)
+    level = (even + odd - flux) * splat(lanes, 1.0 / pixels)
+    for i in range(pixels):
+        store(image, i * width, load(lanes, image, i * width) - level)
+
+
+@compiled
+def eliminate_background(
+    lanes: Any, image: Any, variances: Any, place: Any, ny: Any, nx: Any, profiles: Any, lane_values: Any
+) -> None:
+    """Turn the sums of a fit of x, y and the flux into those of a fit that has a constant as well.
+
+    Parameters as `likelihood.fit_group`; SCORE_*, I_* and J_* are read and written.
+    """
+    width = width_of(lanes)
+    zero = splat(lanes, 0.0)
+    noise, flux = noise_of(lanes, lane_values), load(lanes, lane_values, FLUX * width)
+    s, i, ix, iy, im, j, jx, jy, jm = zero, zero, zero, zero, zero, zero, zero, zero, zero
+    for y in range(ny):
+        for x in range(nx):
+            m, mx, my = model_at(lanes, profiles, x, y)
+            m = flux * m
+            at = (y * nx + x) * width
+            w, wt = weigh(lanes, noise, variances, place + at, m)
+            s = multiply_add(w, load(lanes, image, at) - m, s)
+            i, im = i + w, multiply_add(w, m, im)
+            ix, iy = multiply_add(w, mx, ix), multiply_add(w, my, iy)
+            wt = w * wt
+            j, jm = j + wt, multiply_add(wt, m, jm)
+            jx, jy = multiply_add(wt, mx, jx), multiply_add(wt, my, jy)
+    inverse = splat(lanes, 1.0) / maximum(i, splat(lanes, 1e-30))
+    cx, cy, cf = flux * ix * inverse, flux * iy * inverse, im * inverse
+    _add(lanes, lane_values, SCORE_X, zero - cx * s)
+    _add(lanes, lane_values, SCORE_Y, zero - cy * s)
+    _add(lanes, lane_values, SCORE_F, zero - cf * s)
+    whole = load(lanes, lane_values, I_FF * width)
+    _add(lanes, lane_values, I_XX, zero - cx * cx * i)
+    _add(lanes, lane_values, I_YY, zero - cy * cy * i)
+    _add(lanes, lane_values, I_FF, zero - cf * cf * i)
+    _add(lanes, lane_values, I_XY, zero - cx * cy * i)
+    _add(lanes, lane_values, I_XF, zero - cx * cf * i)
+    _add(lanes, lane_values, I_YF, zero - cy * cf * i)
+    left = load(lanes, lane_values, I_FF * width)
+    store(lane_values, I_FF * width, select(left > splat(lanes, _LEAST_LEFT) * whole, left, zero))
+    jx, jy = flux * jx, flux * jy
+    _add(lanes, lane_values, J_XX, cx * (cx * j - jx - jx))
+    _add(lanes, lane_values, J_YY, cy * (cy * j - jy - jy))
+    _add(lanes, lane_values, J_FF, cf * (cf * j - jm - jm))
+    _add(lanes, lane_values, J_XY, cx * cy * j - cx * jy - cy * jx)
+    _add(lanes, lane_values, J_XF, cx * cf * j - cx * jm - cf * jx)
+    _add(lanes, lane_values, J_YF, cy * cf * j - cy * jm - cf * jy)
+
+
+@compiled
+def _add(lanes: Any, lane_values: Any, row: Any, change: Any) -> None:
+    """Add to a row."""
+    at = row * width_of(lanes)
+    store(lane_values, at, load(lanes, lane_values, at) + change)

@@ -8,10 +8,9 @@ import numpy as np
 import scipy.ndimage
 from numpy.typing import NDArray
 
-from faintspot.slopes.sensor.detection.candidates import find_candidates
-from faintspot.slopes.sensor.detection.following import follow
+from faintspot.slopes.sensor.detection.acquisition import follow
+from faintspot.slopes.sensor.detection.candidates import Lattice, find_candidates
 from faintspot.slopes.sensor.detection.illumination import Illumination, find_illumination
-from faintspot.slopes.sensor.detection.lattice import Lattice
 from faintspot.slopes.sensor.detection.nodes import (
     Drift,
     NodeFlux,

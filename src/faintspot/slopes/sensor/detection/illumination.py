@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.sparse.csgraph import breadth_first_order, connected_components, maximum_flow
 
 from faintspot.base.statistics import MAD_TO_STD
-from faintspot.slopes.sensor.detection.lattice import Lattice
+from faintspot.slopes.sensor.detection.candidates import Lattice
 from faintspot.slopes.sensor.detection.nodes import SEARCH, NodeFlux
 from faintspot.slopes.sensor.region import links_of
 

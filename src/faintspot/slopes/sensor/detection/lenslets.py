@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from faintspot.base.checks import finite_array, number_between, one_of, real_array
 from faintspot.base.errors import InputError
+from faintspot.slopes.sensor.detection.candidates import RATIOS, SMALLEST_PITCH_PX, Lattice, robust_std
 from faintspot.slopes.sensor.detection.fits import FEWEST, LatticeFit, best_fit
-from faintspot.slopes.sensor.detection.lattice import RATIOS, SMALLEST_PITCH_PX, Lattice, robust_std
 from faintspot.slopes.sensor.region import PupilRegion, Rectangle, as_rows, as_tree
 
 _MOST_FOR_NOISE = 50_000  # pixels; the robust deviation of so many is known to 1 %

@@ -14,7 +14,7 @@ import numpy as np
 import scipy.ndimage
 from numpy.typing import NDArray
 
-from faintspot.slopes.sensor.detection.lattice import Lattice, robust_std
+from faintspot.slopes.sensor.detection.candidates import Lattice, robust_std
 
 # Search radius around a node, in pitches: it includes aberrations of +-15 % of the pitch per axis and an
 # error of the first lattice fit, but not the spots of neighbours.

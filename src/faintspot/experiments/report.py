@@ -26,14 +26,15 @@ from faintspot.experiments.paper.figures import (
     sweep_figure,
     triple_picture,
 )
-from faintspot.experiments.paper.tables import (
+from faintspot.experiments.paper.whole import (
     baselines_section,
     gains_section,
     grouped,
     in_words,
+    paper_rows,
+    paper_section,
     parameter_in_words,
 )
-from faintspot.experiments.paper.whole import paper_rows, paper_section
 from faintspot.experiments.study.curves import StudyConditions
 from faintspot.experiments.study.specification import BEST, CORRECTED, StudySpecification
 from faintspot.experiments.study.sweep import PARAMETERS
@@ -299,7 +300,7 @@ def study_figures(dataset: xarray.Dataset) -> Iterator[FigureWithData]:
 
     A sweep is drawn by the first word of its name, so that several make one figure. The paper's pictures
     (figures 1 and 5) come with the paper's sweeps only. A study with methods that know the spot has the
-    figures of `faintspot.experiments.report.page` instead.
+    figures of `faintspot.experiments.report` instead.
     """
     if compares_estimators(dataset):
         yield from estimator_figures(dataset)

@@ -1,1 +1,0 @@
-"""Processes beside the engine that learn filters while it runs."""

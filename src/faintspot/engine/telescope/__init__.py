@@ -1,1 +1,0 @@
-"""Simulated telescope that publishes frames and reads commands, and its changing conditions."""
