@@ -80,11 +80,6 @@ def read_bytes(path: str | Path, what: str, most: int) -> bytes:
         return stream.read(size)
 
 
-def read_lines(path: str | Path, what: str, most: int) -> list[str]:
-    """Return the lines of a text file; parameters and errors are those of `read_bytes`."""
-    return read_bytes(path, what, most).decode("utf-8").splitlines()
-
-
 def check_file_size(path: str | Path, what: str, most: int) -> int:
     """Return the size of a file of at most `most` bytes; errors are those of `read_bytes`."""
     if (size := check_regular(path)) > most:

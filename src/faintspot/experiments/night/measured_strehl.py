@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.errors import InputError
+from faintspot.io.frames import read_array
 
 Floats = NDArray[np.float64]
 
@@ -35,7 +35,7 @@ class MeasuredStrehl:
 
 
 def read_strehl(path: str | Path) -> MeasuredStrehl:
-    """Read a CSV file: Unix time of the middle [s], Strehl ratio, and perhaps the duration [s] of exposures.
+    """Read a table: Unix time of the middle [s], Strehl ratio, and perhaps the duration [s] of exposures.
 
     A first line of names is skipped.
 
@@ -44,17 +44,8 @@ def read_strehl(path: str | Path) -> MeasuredStrehl:
     InputError
         When the file cannot be read, or values are missing or out of range.
     """
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", UserWarning)  # an empty file is refused below
-            table = np.genfromtxt(path, delimiter=",", ndmin=2)
-    except (OSError, ValueError) as error:
-        raise InputError(
-            f"{path}: expected rows of numbers with commas ({str(error).splitlines()[0]})"
-        ) from None
-    if len(table) and np.isnan(table[0]).all():
-        table = table[1:]
-    if not len(table) or table.shape[1] not in _COLUMNS:
+    table = read_array(path).astype(np.float64)
+    if table.ndim != 2 or table.shape[1] not in _COLUMNS:
         raise InputError(
             f"{path}: expected the columns time_s, strehl and perhaps exposure_s, got shape {table.shape}"
         )

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.errors import InputError
-from faintspot.base.files import check_file_size, read_lines
+from faintspot.base.files import check_file_size, read_bytes
 from faintspot.base.variables import VARIABLES
 from faintspot.io.arrays.stored_array import MOST_WHOLE_BYTES, StoredArray
 from faintspot.io.formats.file_format import FileFormat
@@ -47,7 +47,8 @@ class Csv(FileFormat):
             raise InputError(f"{path}: expected no name of an array, as a text has one, got {key!r}")
         try:
             # A number takes at least two characters.
-            values = _numbers(read_lines(path, "rows of numbers", MOST_WHOLE_BYTES // 4))
+            content = read_bytes(path, "rows of numbers", MOST_WHOLE_BYTES // 4)
+            values = _numbers(content.decode("utf-8-sig").splitlines())
         except InputError:
             raise
         except ValueError as error:
@@ -110,7 +111,7 @@ def column_name(name: str, unit: str) -> str:
 
 def _numbers(lines: list[str]) -> NDArray[np.float64]:
     """Return the rows of a text, (rows, columns)."""
-    lines = [line.lstrip("\ufeff") for line in lines if line.split("#")[0].strip("\ufeff \t")]
+    lines = [line for line in lines if line.split("#")[0].strip()]
     separator = next((sign for sign in ",;" if lines and sign in lines[0]), None)
     if lines and not any(map(_is_number, lines[0].split(separator))):
         del lines[0]  # a line of names

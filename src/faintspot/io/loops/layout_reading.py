@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from fnmatch import fnmatchcase
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
@@ -19,13 +20,13 @@ from faintspot.io.formats.registry import frame_format
 from faintspot.io.frames import read_array
 from faintspot.io.loops.layouts import LAYOUTS, TelemetryLayout
 
-_ENDINGS = (".fits", ".fits.gz", ".fits.fz", ".sav", ".npy", *TEXTS)
+_TABLES = (".fits.gz", ".fits", ".sav")
+_ENDINGS = (*_TABLES, ".fits.fz", ".npy", *TEXTS)
 _MOST_FILES = 1 << 14
-_NAMED = 12  # arrays in a message
-_OPEN = ("F", "OPEN", "OFF", "0")
+_LISTED = 12  # arrays in a message
+_OPEN = ("F", "FALSE", "OPEN", "0")
 
-Names = Mapping[str, str]
-"""Locations for `read_array`, by the names of arrays."""
+Names = Mapping[str, str]  # locations for `read_array`, by the names of arrays
 
 
 def read_layout(path: Path, named: Mapping[str, str]) -> dict[str, Any]:
@@ -51,33 +52,32 @@ def read_layout(path: Path, named: Mapping[str, str]) -> dict[str, Any]:
         When the arrays are not of a known layout and the slopes are not named, of several loops none is
         chosen, or a file is damaged.
     """
-    names = _names(path)
+    names, chosen = _names(path), named.get("slopes")
     layouts = _fitting(names)
-    chosen = named.get("slopes")
     if chosen is not None:
-        layouts = [layout for layout in layouts if chosen.upper() in map(str.upper, layout.slopes)]
-    if path.is_dir() and not layouts and chosen is None:
-        tables = [file for file in _files(path) if _is_named(file) and _fitting(_names(file))]
+        layouts = [layout for layout in layouts if chosen.upper() == layout.slopes[0].upper()]
+        layouts = layouts or _timed(names, chosen)
+    elif path.is_dir() and not layouts:
+        files = [file for file in _files(path) if file.name.lower().endswith(_TABLES)]
+        tables = [file for file in files if _fitting(_names(file))]
         if len(tables) == 1:
             return read_layout(tables[0], named)
         if tables:
-            raise InputError(f"{path}: expected one table of a loop; name one as FILE: {_listed(tables)}")
+            listed = _listed(file.name for file in tables)
+            raise InputError(f"{path}: expected one table of a loop; name one as FILE: {listed}")
     if len(layouts) > 1:
-        slopes = [layout.slopes[0] for layout in layouts]
-        raise InputError(f"{path}: has {len(slopes)} loops; choose one with --slopes: {_listed(slopes)}")
+        listed = _listed(layout.slopes[0] for layout in layouts)
+        raise InputError(f"{path}: has {len(layouts)} loops; choose one with --slopes: {listed}")
+    values: dict[str, Any] = {"origin": "arrays", "sources": {}}
     if layouts:
         values = _Reader(path, names, layouts[0]).values()
-    elif chosen is not None and chosen.upper() in map(str.upper, names):
-        values = _Reader(path, names, _timed(names, chosen)).values()
-    elif chosen is not None:
-        values = {"origin": "arrays", "sources": {}}
-    elif path.is_dir() or len(names) > 1:
+    elif chosen is None and (path.is_dir() or len(names) > 1):
         raise InputError(
             f"{path}: expected a known layout of telemetry; name an array with --slopes, and one with "
             f"--commands: {_listed(names) or 'none'}"
         )
-    else:
-        values = {"slopes": read_array(path), "origin": "one array", "sources": {}}
+    elif chosen is None:
+        values["slopes"] = read_array(path)
     for quantity, text in named.items():
         if quantity != "slopes" or "slopes" not in values:
             with errors_within(f"--{quantity.replace('_', '-')}"):
@@ -94,188 +94,141 @@ def _names(path: Path) -> dict[str, str]:
 
 
 def _files(folder: Path) -> list[Path]:
-    """Return the files of arrays in a folder, sorted.
-
-    Raises
-    ------
-    InputError
-        When it has too many files.
-    """
-    files = []
-    for number, file in enumerate(folder.iterdir()):
-        if number >= _MOST_FILES:
-            raise InputError(f"{folder}: expected at most {_MOST_FILES:,} files; name one as FILE")
-        if file.name.lower().endswith(_ENDINGS) and file.is_file():
-            files.append(file)
+    """Return the files of arrays in a folder, sorted; refuse a folder with too many."""
+    files = [file for file in folder.iterdir() if file.name.lower().endswith(_ENDINGS) and file.is_file()]
+    if len(files) > _MOST_FILES:
+        raise InputError(f"{folder}: expected at most {_MOST_FILES:,} files, got {len(files):,}; name one")
     return sorted(files)
 
 
-def _is_named(file: Path) -> bool:
-    """Return whether a file may hold a table of a loop."""
-    return file.name.lower().endswith((".fits", ".fits.gz", ".sav"))
-
-
 def _stem(file: Path) -> str:
-    ending = next(
-        ending for ending in sorted(_ENDINGS, key=len, reverse=True) if file.name.lower().endswith(ending)
-    )
+    ending = next(ending for ending in _ENDINGS if file.name.lower().endswith(ending))
     return file.name[: -len(ending)]
 
 
 def _fitting(names: Names) -> list[TelemetryLayout]:
-    """Return the layouts that arrays have, one for each set of slopes."""
-    fitting: dict[tuple[str, ...], TelemetryLayout] = {}
-    for layout in LAYOUTS:
-        if all(_matches(names, name) for name in (*layout.slopes, *layout.commands[:1])):
-            fitting.setdefault(layout.slopes, layout)
-    # Slopes without commands, in a layout with any.
-    for layout in LAYOUTS:
-        if all(_matches(names, name) for name in layout.slopes):
-            fitting.setdefault(layout.slopes, replace(layout, commands=()))
-    return list(fitting.values())
+    return [layout for layout in LAYOUTS if all(_find(names, name) for name in layout.slopes)]
 
 
-def _timed(names: Names, slopes: str) -> TelemetryLayout:
+def _timed(names: Names, slopes: str) -> list[TelemetryLayout]:
     """Return the layout of slopes that are named, with numbers and times of the frames as in a known one."""
-    for layout in LAYOUTS:
-        if layout.time_s and all(_matches(names, name) for name in layout.time_s):
-            return TelemetryLayout(
-                name="arrays",
-                slopes=(slopes,),
-                frame=layout.frame,
-                time_s=layout.time_s,
-                rate=layout.rate,
-                closed=layout.closed,
-            )
-    return TelemetryLayout(name="arrays", slopes=(slopes,))
+    if not _find(names, slopes):
+        return []
+    own = TelemetryLayout(name="arrays", slopes=(slopes,))
+    for known in LAYOUTS:
+        if all(_find(names, name) for name in (known.frame, *known.time_s) if name):
+            return [replace(own, frame=known.frame, time_s=known.time_s, rate=known.rate)]
+    return [own]
 
 
-def _matches(names: Names, patterns: str, beside: str = "") -> list[str]:
-    """Return the names of the first of some patterns that fits any, those with the number of a file first."""
-    for pattern in patterns.split("|"):
-        found = [name for name in names if pattern and fnmatchcase(name.upper(), pattern.upper())]
+def _find(names: Iterable[str], patterns: str, beside: str = "") -> str:
+    """Return a name that fits the first possible of some patterns, "" if none does.
+
+    Of several names the first one is taken that ends with the number of a file, else the first one.
+    """
+    number = re.search(r"(_\d+)?$", beside)[0]  # type: ignore[index]
+    for pattern in patterns.upper().split("|"):
+        found = sorted(name for name in names if fnmatchcase(name.upper(), pattern))
         if found:
-            number = re.search(r"_\d+$", beside)
-            return sorted(found, key=lambda name: (number is not None and not name.endswith(number[0]), name))
-    return []
+            return next((name for name in found if name.endswith(number)), found[0])
+    return ""
 
 
 def _located(path: Path, names: Names, text: str) -> str:
     """Return the location of an array that an option names."""
-    same = [location for name, location in names.items() if name.upper() == text.upper()]
-    if same:
-        return same[0]
+    if name := _find(names, text):
+        return names[name]
     for folder in (Path(), path if path.is_dir() else path.parent):
         whole = folder / text
-        if whole.exists() or (":" in text and Path(f"{whole}".rpartition(":")[0]).is_file()):
+        if whole.exists() or Path(f"{whole}".rpartition(":")[0]).is_file():
             return f"{whole}"
     return text if path.is_dir() or names else f"{path}:{text}"
 
 
-def _listed(names: Any) -> str:
-    texts = [name.name if isinstance(name, Path) else name for name in names]
-    more = f" and {len(texts) - _NAMED} more" if len(texts) > _NAMED else ""
-    return f"{', '.join(texts[:_NAMED])}{more}"
+def _listed(names: Iterable[str]) -> str:
+    listed = list(names)
+    more = f" and {len(listed) - _LISTED} more" if len(listed) > _LISTED else ""
+    return f"{', '.join(listed[:_LISTED])}{more}"
 
 
 class _Reader:
     """Reader of one loop."""
 
     def __init__(self, path: Path, names: Names, layout: TelemetryLayout) -> None:
-        folder = path if path.is_dir() else path.parent
-        beside = {} if path.is_dir() else {_stem(file): f"{file}" for file in _files(folder) if file != path}
+        beside = {} if path.is_dir() else _names(path.parent)
         self._path, self._names, self._layout, self._all = path, names, layout, {**beside, **names}
+        is_fits = path.is_file() and frame_format(path).name == "FITS"
+        self._headers = [unit.header for unit in units_of(path)] if is_fits else []
         self._sources: dict[str, str] = {}
         self._remarks: list[str] = []
 
     def values(self) -> dict[str, Any]:
         """Return the quantities; see `read_layout`."""
         layout = self._layout
-        slopes = _side_by_side({name: self._rows(name) for name in layout.slopes})[:, slice(*layout.columns)]
-        values: dict[str, Any] = {**layout.known, "slopes": slopes}
-        self._sources["slopes"] = ", ".join(layout.slopes)
-        values |= self._commands(slopes.shape[1])
-        values |= self._timing()
-        if cells := _matches(self._all, layout.cells):
-            values["cells"] = self._read("cells", cells[0])
-        described = dict(self._described())
-        if (state := described.get(layout.closed)) is not None:
-            values["loop"] = "open" if str(state).strip().upper() in _OPEN or state is False else "closed"
-        if "frame_rate_hz" not in values and (rate := described.get(layout.rate)) is not None:
-            values["frame_rate_hz"] = rate
-            self._sources["frame_rate_hz"] = layout.rate
-        law = [f"{name} = {described[name]}" for name in layout.law if name in described]
-        values |= {"control_law": "; ".join(law)} if law else {}
-        frame = values.get("frame")
-        if frame is not None and len(frame) == len(slopes):
+        slopes = self._side_by_side("slopes", layout.slopes)[:, slice(*layout.columns)]
+        values = {**layout.known, "slopes": slopes, **self._commands(slopes.shape[1]), **self._timing()}
+        if cells := _find(self._all, layout.cells):
+            values["cells"] = self._read("cells", cells)
+        if (state := self._stated(layout.closed)) is not None:
+            values["loop"] = "open" if str(state).strip().upper() in _OPEN else "closed"
+        if (law := self._stated(layout.law)) is not None:
+            values["control_law"] = f"{layout.law} = {law}"
+        frame = values.get("frame", ())
+        if len(frame) == len(slopes):
             kept = np.append(True, frame[1:] > np.maximum.accumulate(frame)[:-1])
             if not kept.all():
-                self._remarks.append(
-                    f"frame: left out {np.count_nonzero(~kept)} rows whose number does not rise"
-                )
-                rows = ("slopes", "commands", "frame", "time_s")
-                values |= {
-                    name: values[name][kept] for name in rows if len(values.get(name, ())) == len(kept)
-                }
+                count = np.count_nonzero(~kept)
+                self._remarks.append(f"frame: left out {count} rows whose number does not rise")
+            rows = ("slopes", "commands", "frame", "time_s")
+            values |= {name: values[name][kept] for name in rows if len(values.get(name, ())) == len(kept)}
         return {**values, "origin": layout.name, "sources": self._sources, "remarks": self._remarks}
 
     def _read(self, quantity: str, name: str) -> NDArray[Any]:
-        """Read an array and note where it is from."""
-        location = self._all[name]
-        inside = name in self._names and not self._path.is_dir()
-        self._sources[quantity] = name if inside else Path(location).name
-        return read_array(location)
+        """Read an array of the file or beside it, and note where it is from."""
+        is_inside = name in self._names and not self._path.is_dir()
+        source = name if is_inside else Path(self._all[name]).name
+        self._sources[quantity] = ", ".join(filter(None, [self._sources.get(quantity), source]))
+        return read_array(self._all[name])
 
-    def _rows(self, name: str) -> NDArray[Any]:
-        """Return an array of the file as (frames, values)."""
-        array = read_array(self._names[_matches(self._names, name)[0]])
-        return array.reshape(len(array), -1)
+    def _side_by_side(self, quantity: str, names: Iterable[str]) -> NDArray[Any]:
+        """Read arrays of the file as one, (frames, values)."""
+        arrays = [self._read(quantity, _find(self._names, name)) for name in names]
+        if len({len(array) for array in arrays}) > 1:
+            lengths = ", ".join(f"{len(array)}" for array in arrays)
+            raise InputError(f"{self._sources[quantity]}: expected arrays of as many frames, got {lengths}")
+        return np.hstack([array.reshape(len(array), -1) for array in arrays])
 
     def _commands(self, width: int) -> dict[str, Any]:
-        """Return commands, and the matrix for as many of them as there is one for."""
-        present = {name: found[0] for name in self._layout.commands if (found := _matches(self._names, name))}
-        if not present:
-            return {}
-        arrays = {name: self._rows(name) for name in present}
-        matrices = self._interactions(arrays, width)
-        values: dict[str, Any] = {}
-        control = _matches(self._all, self._layout.control, self._path.stem.partition(".")[0])
-        if len(matrices) < len(arrays) and control:
-            values["control_matrix"] = self._control(control[0], width, sum(map(_width, arrays.values())))
-        elif matrices:
-            for name in [name for name in arrays if name not in matrices]:
-                self._remarks.append(f"commands: {present[name]} left out, as there is no matrix for it")
-                del arrays[name]
-            values["interaction_matrix"] = np.hstack([matrices[name] for name in arrays])
-        if "control_matrix" in values:
-            self._sources.pop("interaction_matrix", None)
-        self._sources["commands"] = ", ".join(present[name] for name in arrays)
-        return {**values, "commands": _side_by_side(arrays)}
+        """Return commands and their matrix; those without a matrix are left out if others have one."""
+        layout, stem = self._layout, self._path.name.partition(".")[0]
+        pairs = zip_longest(layout.commands, layout.interaction, fillvalue="")
+        matrices = {_find(self._names, name): _find(self._all, matrix, stem) for name, matrix in pairs}
+        matrices.pop("", None)
+        known = {name: matrix for name, matrix in matrices.items() if matrix}
+        control = _find(self._all, layout.control, stem)
+        if len(known) > 0 and (len(known) == len(matrices) or not control):
+            for name in matrices.keys() - known:
+                self._remarks.append(f"commands: {name} left out, as there is no matrix for it")
+            commands = self._side_by_side("commands", known)
+            return {"commands": commands, **self._interaction(known.values(), width, commands.shape[1])}
+        values = {"commands": self._side_by_side("commands", matrices)} if matrices else {}
+        if matrices and layout.identity:
+            self._sources["interaction_matrix"] = "an assumed identity"
+            values["interaction_matrix"] = np.eye(width)
+        elif matrices and control:
+            values["control_matrix"] = self._control(control, width, values["commands"].shape[1])
+        return values
 
-    def _interactions(self, arrays: Mapping[str, NDArray[Any]], width: int) -> dict[str, NDArray[Any]]:
-        """Return the interaction matrices (slopes, commands) of arrays of commands that have one."""
-        if self._layout.identity:
-            self._sources["interaction_matrix"] = "identity"
-            return {name: np.eye(width) for name in arrays}
-        matrices, files = {}, []
-        for name, commands in arrays.items():
-            found = _matches(
-                self._all, self._layout.interaction.get(name, ""), self._path.stem.partition(".")[0]
+    def _interaction(self, names: Iterable[str], width: int, commands: int) -> dict[str, Any]:
+        """Return the interaction matrices of arrays of commands as one."""
+        found = [np.atleast_2d(self._read("interaction_matrix", name).squeeze()) for name in names]
+        blocks = [block if len(block) == width else block.T for block in found]
+        if any(len(block) != width for block in blocks) or sum(len(block.T) for block in blocks) != commands:
+            raise InputError(
+                f"{self._sources['interaction_matrix']}: expected shape {(width, commands)}, got "
+                f"{', '.join(str(block.shape) for block in found)}; name another with --interaction-matrix"
             )
-            if not found:
-                continue
-            matrix = self._read("interaction_matrix", found[0]).squeeze()
-            files.append(self._sources["interaction_matrix"])
-            shape = width, _width(commands)
-            matrix = matrix.T if matrix.shape == shape[::-1] else matrix
-            if matrix.shape != shape:
-                raise InputError(
-                    f"{self._all[found[0]]}: expected shape {shape}, got {matrix.shape}; name another with "
-                    "--interaction-matrix"
-                )
-            matrices[name] = matrix
-            self._sources["interaction_matrix"] = ", ".join(files)
-        return matrices
+        return {"interaction_matrix": np.hstack(blocks)}
 
     def _control(self, name: str, width: int, commands: int) -> NDArray[Any]:
         """Return the rows of a control matrix for commands."""
@@ -288,52 +241,26 @@ class _Reader:
         return matrix.reshape(-1, width)[:commands]
 
     def _timing(self) -> dict[str, Any]:
-        """Return frame numbers and times, as far as these are recorded."""
+        """Return frame numbers, and times, else the rate of the header, as far as these are recorded."""
         layout, values = self._layout, dict[str, Any]()
-        if frame := _matches(self._names, layout.frame):
-            values["frame"] = self._read("frame", frame[0]).reshape(-1).astype(np.int64)
-        parts = {
-            found[0]: unit for name, unit in layout.time_s.items() if (found := _matches(self._names, name))
-        }
-        if parts:
-            time = _side_by_side({name: self._rows(name) * unit for name, unit in parts.items()}).sum(axis=1)
-            if (np.diff(time) > 0).all():
-                values["time_s"] = time
-                self._sources["time_s"] = ", ".join(parts)
-            else:
-                self._remarks.append(f"times: {', '.join(parts)} do not rise, so they are not used")
+        if frame := _find(self._names, layout.frame):
+            values["frame"] = self._read("frame", frame).reshape(-1).astype(np.int64)
+        units = {name: unit for own, unit in layout.time_s.items() if (name := _find(self._names, own))}
+        time_s = self._side_by_side("time_s", units) @ list(units.values()) if units else np.zeros(2)
+        if (np.diff(time_s) > 0).all():
+            return {**values, "time_s": time_s}
+        if names := self._sources.pop("time_s", ""):
+            self._remarks.append(f"times: {names} do not rise, so they are not used")
+        if (rate := self._stated(layout.rate)) is not None:
+            values["frame_rate_hz"] = rate
+            self._sources["frame_rate_hz"] = layout.rate
         return values
 
-    def _described(self) -> Iterator[tuple[str, Any]]:
-        """Yield what headers or arrays say of rate, state and control law, by the layout's names."""
-        layout = self._layout
-        units = [] if self._path.is_dir() else _headers(self._path)
-        for wanted in (layout.rate, layout.closed, *layout.law):
-            for name in wanted.split("|"):
-                for header in units:
-                    if name and name in header:
-                        yield wanted, header[name]
-            if wanted in layout.law and (found := _matches(self._names, wanted)):
-                yield (
-                    wanted,
-                    " ".join(f"{value:g}" for value in read_array(self._names[found[0]]).ravel()[:16]),
-                )
-
-
-def _headers(path: Path) -> list[Any]:
-    """Return the headers of a FITS file; of another file none."""
-    if frame_format(path).name != "FITS":
-        return []
-    return [unit.header for unit in units_of(path)]
-
-
-def _side_by_side(arrays: Mapping[str, NDArray[Any]]) -> NDArray[Any]:
-    """Return arrays (frames, ...) as one."""
-    if len({len(array) for array in arrays.values()}) > 1:
-        listed = ", ".join(f"{len(array)} of {name}" for name, array in arrays.items())
-        raise InputError(f"expected arrays of as many frames, got {listed}")
-    return np.hstack(list(arrays.values()))
-
-
-def _width(array: NDArray[Any]) -> int:
-    return int(array.shape[1])
+    def _stated(self, patterns: str) -> Any:
+        """Return what the headers say, or an array as text; None if neither does."""
+        for name in filter(None, patterns.split("|")):
+            for header in self._headers:
+                if name in header:
+                    return header[name]
+        found = _find(self._names, patterns)
+        return " ".join(f"{value:g}" for value in read_array(self._names[found]).flat[:16]) if found else None

@@ -9,13 +9,13 @@ https://github.com/aditya-sengupta/tip-tilt-control (its tip and tilt) and https
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-_MICROSECOND, _KECK_TICK = 1e-6, 1e-7
+_KECK_TICK_S = 1e-7
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,9 +32,9 @@ class TelemetryLayout:
     columns: tuple[int | None, int | None] = (None, None)
     """First of their columns that are slopes, and the one after the last."""
     commands: tuple[str, ...] = ()
-    """Arrays (frames, commands), side by side; a file of this kind has the first."""
-    interaction: Mapping[str, str] = field(default_factory=dict)
-    """For each array of commands its interaction matrix, in the file or in a file beside it."""
+    """Arrays (frames, commands), side by side, of which some may be absent."""
+    interaction: tuple[str, ...] = ()
+    """Interaction matrix of each of these, in the file or in a file beside it."""
     identity: bool = False
     """Whether commands have the axes and the unit of the slopes."""
     control: str = ""
@@ -47,8 +47,8 @@ class TelemetryLayout:
     """Frame rate [Hz] in the header."""
     closed: str = ""
     """State of the loop in the header."""
-    law: tuple[str, ...] = ()
-    """Keywords or arrays that describe the control law."""
+    law: str = ""
+    """Keyword or array that describes the control law."""
     known: Mapping[str, Any] = field(default_factory=dict)
     """Values that all files of this kind have: slope_order, slope_unit, subaperture_m, cells."""
 
@@ -62,67 +62,45 @@ def _keck_cells() -> NDArray[np.int64]:
     return mask
 
 
-_SPARTA = TelemetryLayout(
-    name="SPARTA table",
-    slopes=("Gradients",),
-    commands=("*Positions",),
-    control="*REC1.CM*|*REC1.HOCM*",
-    frame="FrameCounter",
-    time_s={"Seconds": 1.0, "USeconds": _MICROSECOND},
-    rate="ESO AOS LOOP RATE",
-    closed="ESO AOS HO LOOP ST|ESO AOS LOOP ST",
-    law=("ESO AOS GLOBAL GAIN",),
-    known={"slope_order": "pairs"},
-)
-_KECK = TelemetryLayout(
-    name="Keck save file, high order",
-    slopes=("A.OFFSETCENTROID",),
-    commands=("A.DMCOMMAND", "A.TTCOMMANDS"),
-    control="RX",
-    time_s={"A.TIMESTAMP": _KECK_TICK},
-    law=("DM_SERVO",),
-    known={
-        "slope_order": "pairs",
-        "slope_unit": "px",
-        "subaperture_m": 0.5625,
-        "cells": _keck_cells(),
-    },
-)
-
 LAYOUTS: tuple[TelemetryLayout, ...] = (
-    replace(
-        _SPARTA,
-        name="SPARTA table of CIAO or SPHERE",
-        commands=("HODM_Positions", "ITTM_Positions"),
-        interaction={"HODM_Positions": "*HO_IM*", "ITTM_Positions": "*ITT_IM*"},
+    TelemetryLayout(
+        name="SPARTA table",
+        slopes=("Gradients",),
+        # CIAO and SPHERE, with the tip-tilt mirror; ERIS; GPAO; NAOMI, whose matrix is that of modes; others
+        commands=(
+            "HODM_Positions|DSM_Positions|DM_Positions|ModalCoefficients|*_Positions|Positions",
+            "ITTM_Positions",
+        ),
+        interaction=("*HO_IM*|*SynthIMComp.IM*|ModalRecnCalibrat.REF_IM*|*SYNTHETIC_*IM*", "*ITT_IM*"),
+        control="*REC1.CM*|*REC1.HOCM*",
+        frame="FrameCounter",
+        time_s={"Seconds": 1.0, "USeconds": 1e-6},
+        rate="ESO AOS LOOP RATE",
+        closed="ESO AOS HO LOOP ST|ESO AOS LOOP ST",
+        law="ESO AOS GLOBAL GAIN",
+        known={"slope_order": "pairs"},
     ),
-    replace(
-        _SPARTA,
-        name="SPARTA table of NAOMI",
-        commands=("ModalCoefficients",),
-        interaction={"ModalCoefficients": "ModalRecnCalibrat.REF_IM*"},
+    TelemetryLayout(
+        name="Keck save file, high order",
+        slopes=("A.OFFSETCENTROID",),
+        commands=("A.DMCOMMAND", "A.TTCOMMANDS"),
+        control="RX",
+        time_s={"A.TIMESTAMP": _KECK_TICK_S},
+        law="DM_SERVO",
+        known={
+            "slope_order": "pairs",
+            "slope_unit": "px",
+            "subaperture_m": 0.5625,
+            "cells": _keck_cells(),
+        },
     ),
-    replace(
-        _SPARTA,
-        name="SPARTA table of ERIS",
-        commands=("DSM_Positions",),
-        interaction={"DSM_Positions": "CLMatrixOptimiser.SYNTHETIC_*IM*"},
-    ),
-    replace(
-        _SPARTA,
-        name="SPARTA table of GPAO",
-        commands=("DM_Positions",),
-        interaction={"DM_Positions": "*SynthIMComp.IM*"},
-    ),
-    _SPARTA,
-    _KECK,
     TelemetryLayout(
         name="Keck save file, tip-tilt sensor",
         slopes=("B.DTTCENTROIDS",),
         commands=("B.DTTCOMMANDS",),
         identity=True,
-        time_s={"B.TIMESTAMP": _KECK_TICK},
-        law=("DT_SERVO",),
+        time_s={"B.TIMESTAMP": _KECK_TICK_S},
+        law="DT_SERVO",
     ),
     TelemetryLayout(
         name="Keck save file, tip and tilt of the wavefront sensor",
@@ -130,15 +108,15 @@ LAYOUTS: tuple[TelemetryLayout, ...] = (
         columns=(-3, -1),  # after the actuators and before focus
         commands=("A.TTCOMMANDS",),
         identity=True,
-        time_s={"A.TIMESTAMP": _KECK_TICK},
-        law=("DT_SERVO",),
+        time_s={"A.TIMESTAMP": _KECK_TICK_S},
+        law="DT_SERVO",
         known={"slope_unit": "arcsec"},
     ),
     TelemetryLayout(
         name="folder of ciao",
         slopes=("x_slopes", "y_slopes"),
         commands=("commands",),
-        interaction={"commands": "*poke*"},
+        interaction=("*poke*",),
         cells="*mask*",
         time_s={"time_s": 1.0},
         known={"slope_unit": "rad"},
@@ -146,7 +124,7 @@ LAYOUTS: tuple[TelemetryLayout, ...] = (
     TelemetryLayout(
         name="folder of arrays",
         slopes=("slopes",),
-        interaction={"commands": "interaction_matrix|*poke*"},
+        interaction=("interaction_matrix|*poke*",),
         commands=("commands",),
         control="control_matrix",
         cells="cells|*mask*",
@@ -154,4 +132,4 @@ LAYOUTS: tuple[TelemetryLayout, ...] = (
         time_s={"time_s": 1.0},
     ),
 )
-"""Layouts in the order in which they are tried; of those with the same slopes the first that fits."""
+"""Known layouts; no two have the same slopes."""
