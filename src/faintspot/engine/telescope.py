@@ -180,8 +180,6 @@ class SimulatedTelescope(Readout, Closing):
         keep_truth: Callable[[tuple[float, ...]], None] | None = None,
         **rows: Unpack[RowTimes],
     ) -> None:
-        if configuration.camera.rolling_shutter:
-            raise InputError("camera.rolling_shutter: expected 0, as this telescope knows no later commands")
         self.configuration, self.name, self._say = configuration, name, say or (lambda _: None)
         self._keep_truth = keep_truth
         self._conditions = ObservingConditions.of(configuration)

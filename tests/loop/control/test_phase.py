@@ -60,7 +60,7 @@ def test_a_filter_for_reversed_winds_leaves_no_more_than_the_integrator() -> Non
     )
     true, wrong = (
         SlopeModel.of_covariances(np.array([layer.lagged_px2(0.004) for layer in winds.layers()]))
-        for winds in (air, air.turned(1.0, 180.0))
+        for winds in (air, replace(air, wind_m_per_s=-np.asarray(air.wind_m_per_s)))
     )
     noise_px, gain = 1.2, 0.1
     lines = [CommandDelayLine(36, 2) for _ in range(3)]

@@ -59,7 +59,7 @@ def test_a_place_that_cannot_be_written_is_named(record: LoopRecord, tmp_path: P
 
 @pytest.mark.parametrize(
     "values",
-    [{"label": ""}, {"settings": None}, {"gain": -1.0}, {"gain": float("nan")}, {"window_pixels": 1}],
+    [{"label": ""}, {"settings": None}, {"gain": -1.0}, {"gain": float("nan")}],
 )
 def test_bad_methods_are_refused(values: dict[str, Any]) -> None:
     with pytest.raises(InputError, match=r"method\."):

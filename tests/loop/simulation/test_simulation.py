@@ -164,12 +164,6 @@ def test_gain_correction_makes_a_loop_of_low_gain_as_fast() -> None:
     assert corrected.mean_strehl() > not_corrected.mean_strehl()
 
 
-def test_smaller_windows_close_the_loop() -> None:
-    loop = load_loop("diffraction_limit").replace("run", frames=60, settle_frames=30)
-    method = Method("window", fs.Settings("brightest", keep_brightest=50), window_pixels=10)
-    assert simulate_loop(loop.replace("camera", photons_per_subaperture=400.0), [method]).mean_strehl() > 0.3
-
-
 def test_invalid_sub_apertures_do_no_harm() -> None:
     loop = faint().replace("run", frames=60)
     method = Method("nothing", fs.Settings(estimator="thresholded", threshold_e=1e6))
@@ -185,7 +179,6 @@ def test_invalid_sub_apertures_do_no_harm() -> None:
         ([plain()], [0, 1], "schedule = 1"),
         ([plain()], [[0]], "schedule"),
         ([plain()] * 2, [0.5], "whole number"),
-        ([Method("wide", PLAIN, window_pixels=20)], [0], "window_pixels = 20"),
     ],
 )
 def test_impossible_runs_are_refused(methods: list[Method], schedule: object, message: str) -> None:

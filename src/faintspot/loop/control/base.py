@@ -48,12 +48,6 @@ class CommandDelayLine:
         return self._rows[(self.next_row + 1) % len(self._rows)]
 
     @property
-    def around(self) -> tuple[Floats, Floats, Floats]:
-        """Commands of the last frame, of this one and of the next, for a delay of at least 2 frames."""
-        before, acting, after = (self._rows[(self.next_row + step) % len(self._rows)] for step in range(3))
-        return before, acting, after
-
-    @property
     def latest(self) -> Floats:
         """Last computed command, which may not act yet."""
         return self._rows[self.next_row - 1]

@@ -163,6 +163,4 @@ def recorded_loop(record: LoopRecord, method: Method) -> Recording:
 
 def _without_assumed(configuration: LoopConfiguration) -> LoopConfiguration:
     """Return the configuration without values that do not affect the telemetry."""
-    usual = ControlParameters()
-    names = ("winds", "assumed_wind_factor", "assumed_wind_turn_deg")
-    return configuration.replace("control", **{name: getattr(usual, name) for name in names})
+    return configuration.replace("control", winds=ControlParameters().winds)

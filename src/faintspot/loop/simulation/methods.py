@@ -64,8 +64,6 @@ class Method(Options, table="method"):
         learn from telemetry of a loop with the integrator, in other turbulence.
     noise_scale : float
         What control multiplies the variance of the slopes' noise by that telemetry shows.
-    window_pixels : int, optional
-        Side of the middle part of each sub-aperture's window that is used. Default: all.
     psf, score : PSF, FixedWeights, optional
         For the estimators that need them. Default PSF: that of a flat wavefront, or with a laser that of the
         profile learnt.
@@ -73,7 +71,7 @@ class Method(Options, table="method"):
     Raises
     ------
     InputError
-        For an empty label, an unknown variant or control, a gain, window or scale out of range.
+        For an empty label, an unknown variant or control, a gain or scale out of range.
 
     Examples
     --------
@@ -92,7 +90,6 @@ class Method(Options, table="method"):
     variants: tuple[str, ...] = setting((), kind=TEXTS, choices=tuple(VARIANTS))
     control: str = setting(INTEGRATOR, choices=tuple(CONTROLS))
     noise_scale: float = number(1.0, 0, 100, low_open=True)
-    window_pixels: int | None = number(None, 2, 64, whole=True)
     psf: PSF | None = None
     score: FixedWeights | None = None
 

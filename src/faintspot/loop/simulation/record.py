@@ -153,7 +153,7 @@ def make_controller(
 
 def slope_turbulence(configuration: LoopConfiguration, cells: NDArray[np.int64]) -> SlopeTurbulence:
     """Return the theory of slopes in turbulence with the assumed winds."""
-    atmosphere, control = configuration.atmosphere, configuration.control
+    atmosphere = configuration.atmosphere
     angle = np.deg2rad(atmosphere.wind_direction_deg)
     around = np.column_stack([np.cos(angle), np.sin(angle)])
     return SlopeTurbulence(
@@ -164,7 +164,7 @@ def slope_turbulence(configuration: LoopConfiguration, cells: NDArray[np.int64])
         atmosphere.outer_scale_m,
         np.array(atmosphere.fraction),
         np.array(atmosphere.wind_speed_m_per_s, np.float64)[:, None] * around,
-    ).turned(control.assumed_wind_factor, control.assumed_wind_turn_deg)
+    )
 
 
 def plant_of(configuration: LoopConfiguration, optics: LoopOptics) -> LoopPlant:

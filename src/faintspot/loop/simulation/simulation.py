@@ -209,7 +209,7 @@ class _Loop:
         time = (self.frame_numbers[frame] + 0.5) / self.configuration.control.frame_rate_hz
         after, wavefront = self.telescope_model.wavefronts(time, commands)
         self._observe(frame, time, after)
-        slopes = self._measure(frame, self.telescope_model.by_rows(time, wavefront, self.line.around))
+        slopes = self._measure(frame, wavefront)
         error = np.concatenate([slopes.standard_error_x, slopes.standard_error_y])
         per_px = 1 / self.divisors[number]
         vector, covariance = (values.astype(np.float64) for values in (slopes.vector, slopes.covariance_xy))

@@ -102,12 +102,6 @@ class SlopeTurbulence:
         """Squared slope [px] for a gradient of 1 rad/m at 500 nm."""
         return (R0_WAVELENGTH_M / (2 * math.pi) / self.pixel_scale_rad) ** 2
 
-    def turned(self, factor: float, degrees: float) -> Self:
-        """Return the same turbulence with all winds multiplied by a factor and rotated by an angle."""
-        angle = math.radians(degrees)
-        turn = factor * np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
-        return replace(self, wind_m_per_s=np.asarray(self.wind_m_per_s) @ turn.T)
-
     def layers(self) -> list[Self]:
         """Return each layer separately, with its own strength."""
         part = np.asarray(self.fraction, np.float64) / np.sum(self.fraction)

@@ -38,7 +38,6 @@ from faintspot.slopes.spots.von_karman import R0_WAVELENGTH_M
 
 SPOT_FWHM = 0.886  # full width at half maximum of sinc^2, in lambda / d
 _MOST_POINTS = 4096**2  # of a wavefront
-_ROLLING_DELAY = 2
 _POINT_FIELD = 0.9  # of a window that holds a laser guide star
 _POSITION_RANGE_PX = {CLOSED: 2.0, OPEN: 5.0}
 
@@ -311,11 +310,6 @@ def _check_sampling(loop: LoopConfiguration) -> None:
         raise InputError("natural_star: expected a table laser beside it, got none")
     if loop.laser is not None and loop.sensor.spot_elongation > 1:
         raise InputError("sensor.spot_elongation: expected 1 with a laser, which elongates the spots itself")
-    if loop.camera.rolling_shutter and loop.control.delay_frames < _ROLLING_DELAY:
-        raise InputError(
-            f"camera.rolling_shutter = {loop.camera.rolling_shutter:g}: expected control.delay_frames >= "
-            f"{_ROLLING_DELAY}, as the last rows see the mirror's next commands"
-        )
     sensor = loop.sensor
     check_size(
         "sensor: (subapertures x samples)^2", [(sensor.subapertures * sensor.samples) ** 2], _MOST_POINTS

@@ -90,8 +90,6 @@ class Camera(StarLight, ConfigurationTable, table="camera"):
     bits: int | None = number(None, 1, 32, whole=True)
     background_e: float = number(0.0, 0.0, 1e6)
     dark_e: float = number(0.0, 0.0, 1e6)
-    rolling_shutter: float = number(0.0, 0.0, 1.0)
-    """Part of a frame by which the exposure of the last row is later than that of the first."""
 
 
 @dataclass(frozen=True)
@@ -112,10 +110,6 @@ class ControlParameters(ConfigurationTable, table="control"):
     """Length of the closed loop with an integrator from which other controllers learn; never scored."""
     winds: str = setting(LEARNT, choices=WINDS)
     """Winds of a predictive model: "learnt" from telemetry, "assumed" (those of the atmosphere) or "none"."""
-    assumed_wind_factor: float = number(1.0, 0.0, 100.0)
-    """Assumed winds as a multiple of the true ones."""
-    assumed_wind_turn_deg: float = number(0.0, -360.0, 360.0)
-    """Angle by which assumed winds are turned."""
 
 
 @dataclass(frozen=True)

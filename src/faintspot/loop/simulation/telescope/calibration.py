@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.base.errors import InputError
 from faintspot.loop.simulation.configuration.configuration import LoopConfiguration
 from faintspot.loop.simulation.configuration.sections import CLOSED
 from faintspot.loop.simulation.methods import Method
@@ -20,7 +19,6 @@ from faintspot.slopes.estimators.built_in.gravity import BrightestPixels
 from faintspot.slopes.pipeline.light import MeanFlux
 from faintspot.slopes.pipeline.settings import Settings
 from faintspot.slopes.pipeline.slope_pipeline import SlopePipeline
-from faintspot.slopes.sensor.layout import Layout
 from faintspot.slopes.spots.psf import PSF, spot_psf
 
 Floats = NDArray[np.float64]
@@ -61,28 +59,10 @@ _DITHER_STEP_S = 0.1  # between wavefronts, so that they differ
 _SMALLEST_GAIN = 0.05  # less is noise, and dividing by it would make the loop unstable
 
 
-def method_layout(layout: Layout, method: Method) -> Layout:
-    """Return the windows of a method: the middle of the sensor's windows.
-
-    Raises
-    ------
-    InputError
-        When they are larger than the sensor's.
-    """
-    side = layout.window[0]
-    pixels = side if method.window_pixels is None else method.window_pixels
-    if pixels > side:
-        raise InputError(
-            f"method.window_pixels = {pixels}: expected at most the {side} of the sensor's windows"
-        )
-    corners = layout.corners + (side - pixels) // 2
-    return Layout(layout.frame_shape, (pixels, pixels), corners, layout.centres, layout.cells)
-
-
 def make_pipeline(configuration: LoopConfiguration, sensor: ShackHartmann, method: Method) -> SlopePipeline:
     """Return the pipeline of a method, with the reference slopes of a flat wavefront."""
     return SlopePipeline(
-        method_layout(sensor.layout, method),
+        sensor.layout,
         method.settings,
         camera_calibration(configuration),
         reference_slopes(configuration, sensor, method),
@@ -103,7 +83,7 @@ def reference_slopes(
     at its strength of denoising they would be denoised to nothing.
     """
     bright = SlopePipeline(
-        method_layout(sensor.layout, method),
+        sensor.layout,
         method.settings.replace(estimator=method.settings.estimator.for_bright_flux(), flux_e=None),
         Calibration(dark=0.0, read_noise_e=1.0),
         psf=_psf(configuration, method),

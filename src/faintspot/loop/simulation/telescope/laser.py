@@ -265,7 +265,7 @@ _OF_LEARNING = 8  # random numbers
 
 def with_spots(sodium: KnownSodium, configuration: LoopConfiguration, method: Method) -> Method:
     """Return a method that knows the spots."""
-    pixels = method.window_pixels or configuration.sensor.pixels
+    pixels = configuration.sensor.pixels
     psf, scene = sodium.psf((pixels, pixels)), configuration.scene
     if FILTER not in method.variants:
         return replace(method, psf=psf)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import TYPE_CHECKING
@@ -92,10 +91,6 @@ class TelescopeModel:
         self.photons = configuration.photons
         self.detector = make_detector(configuration)
         self._laser = laser_source(configuration)
-        self._rolling, self._rate_hz = (
-            configuration.camera.rolling_shutter,
-            configuration.control.frame_rate_hz,
-        )
         self._sees_mirror = configuration.control.mode == CLOSED
         self._science = configuration.science
         self._seed, self._realisation = seed, realisation
@@ -107,38 +102,6 @@ class TelescopeModel:
         atmosphere = self.atmosphere.wavefront_nm(time_s)
         after = atmosphere + self.optics.mirror.wavefront_nm(commands)
         return after, after if self._sees_mirror else atmosphere
-
-    def by_rows(
-        self,
-        time_s: float,
-        seen_nm: NDArray[np.float32],
-        commands: Sequence[NDArray[np.floating]],
-    ) -> NDArray[np.float32]:
-        """Return the wavefront that the rows of a rolling shutter see, each in the middle of its exposure.
-
-        It is interpolated linearly between the first, the middle and the last row. The middle row is exposed
-        as a frame without a rolling shutter is; others see the commands of two frames, in proportion.
-
-        Parameters
-        ----------
-        time_s : float
-            Middle of the frame.
-        seen_nm : (points, points) array
-            Wavefront of the middle row, as `wavefronts` returns it.
-        commands : sequence of (commands,) array
-            Those of the frame before, of this frame and of the frame after.
-        """
-        if not self._rolling:
-            return seen_nm
-        before, acting, after = commands
-        ends = []
-        for side, commands_then in ((-0.5, before), (0.5, after)):
-            mixed = acting + 0.5 * self._rolling * (commands_then - acting)
-            ends.append(self.wavefronts(time_s + side * self._rolling / self._rate_hz, mixed)[1])
-        height = (2.0 * np.arange(len(seen_nm)) + 1.0) / len(seen_nm) - 1.0  # -1 to 1
-        first, last = (np.maximum(side * height, 0.0).astype(np.float32)[:, None] for side in (-1.0, 1.0))
-        rows: NDArray[np.float32] = (1.0 - first - last) * seen_nm + first * ends[0] + last * ends[1]
-        return rows
 
     def truth(self, time_s: float, wavefront_nm: NDArray[np.float32]) -> Truth:
         """Return the true values of a residual wavefront."""
