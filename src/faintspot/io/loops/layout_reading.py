@@ -246,7 +246,10 @@ class _Reader:
         if frame := _find(self._names, layout.frame):
             values["frame"] = self._read("frame", frame).reshape(-1).astype(np.int64)
         units = {name: unit for own, unit in layout.time_s.items() if (name := _find(self._names, own))}
-        time_s = self._side_by_side("time_s", units) @ list(units.values()) if units else np.zeros(2)
+        parts = self._side_by_side("time_s", units) if units else np.zeros((2, 0))
+        if parts.shape[1] != len(units):
+            raise InputError(f"{self._sources['time_s']}: expected a number for each frame, got more")
+        time_s = parts @ list(units.values())
         if (np.diff(time_s) > 0).all():
             return {**values, "time_s": time_s}
         if names := self._sources.pop("time_s", ""):
