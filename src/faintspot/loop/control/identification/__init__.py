@@ -5,7 +5,7 @@ spectra of frozen turbulence), `layer_likelihood` (their fit), `layers` (winds, 
 together), `model` (what is learnt, and its file), `learning` (all of it, once and again). Of loops of other
 systems: `recording` (slopes and commands), `cell_order` (of their sub-apertures), `loop_delay` (delay and
 centroid gain), `open_loop` (slopes without the mirror), `controlled_loop` (measured properties),
-`relearning` (frames of the running loop, and a process that learns from them), `predictive_control` (all of
-it). Of sensors without geometry: `modal_loop` (modes of the interaction matrix), `modal_delay` (delay, gain
-and law), `modal_model` (a predictor of each mode).
+`misregistration` (of the mirror), `relearning` (frames of the running loop, and a process that learns from
+them), `predictive_control` (all of it). Of sensors without geometry: `modal_loop` (modes of the interaction
+matrix), `modal_delay` (delay, gain and law), `modal_model` (a predictor of each mode).
 """

@@ -25,6 +25,7 @@ from faintspot.loop.control.identification.learning import (
     learn_controller,
 )
 from faintspot.loop.control.identification.loop_delay import FEWEST_SUBAPERTURES, LoopDelay
+from faintspot.loop.control.identification.misregistration import MovableMatrix, misregistration
 from faintspot.loop.control.identification.modal_loop import LEAST_MEASURED, modes_of
 from faintspot.loop.control.identification.modal_model import learn_modes, share_of_modes
 from faintspot.loop.control.identification.model import Kalman, state_space, write_matrices
@@ -34,6 +35,7 @@ from faintspot.loop.control.identification.open_loop import (
     Wind,
     measured_delay,
     open_loop_of,
+    runs_of,
     site_of_loop,
     winds_of,
     with_axes_of,
@@ -60,6 +62,7 @@ _EASED_FRAMES = 100  # in which it gets there
 _MARGIN = 0.55  # of the largest stable loop gain, for the largest centroid gain that is likely
 _ABSURD = 1e3  # of the rms of recorded slopes: no such slope is measured
 _CLEARLY = 0.99  # part of what winds leave, below which modes alone replace them
+_CORRECTIONS = 2  # of the matrix, each followed by learning
 _CONTENTS = "a predictive controller"
 _RELEARNT_FROM = 750  # frames since the integrator took over, from which is learnt in the background
 _PLAIN_AT_FIRST = 200  # frames in which it may drive because the filter has just begun
@@ -484,9 +487,7 @@ def learn(recording: Recording, start: Identified | None = None) -> PredictiveCo
     if loop.cells is None or len(loop.cells) < FEWEST_SUBAPERTURES:
         measured, used = measured_delay(modes_of(loop).recording)
         return _in_modes(ready, LoopInModes.of(ready, replace(used, delay_error=measured.delay_error)))
-    measured, used = measured_delay(loop)
-    delay = with_axes_of(loop, replace(used, delay_error=measured.delay_error))
-    return learn_observed(ObservedLoop(ready, delay, open_loop_of(loop, delay)), start)
+    return learn_observed(_observed(ready), start)
 
 
 @dataclass(frozen=True, eq=False)
@@ -503,6 +504,38 @@ class ObservedLoop:
 
 def learn_observed(observed: ObservedLoop, start: Identified | None = None) -> PredictiveControl:
     """Learn as `learn` from a recording whose delay and open-loop slopes are known."""
+    described, learnt = _with_winds(observed, start)
+    if not learnt.is_local:
+        observed, described, learnt = _corrected(observed, described, learnt, start)
+    ready, seen, modes = observed.ready, observed.seen, LoopInModes.of(observed.ready, observed.delay)
+    if not learnt.is_local:
+        share = share_of_modes(modes, learnt, described.plant(), seen)
+        if share < _CLEARLY:
+            return _in_modes(ready, modes)
+        description = f"{learnt.description}, modes alone leave {share:.2f} of what winds leave"
+        learnt = replace(learnt, description=description)
+    described, identified = replace(described, law=modes.described.law), learnt.identified
+    if identified is not None and identified.is_layered:
+        described = replace(described, winds=np.array([wind.row() for wind in winds_of(identified)]))
+    return _controlling(described, ready, seen, learnt)
+
+
+def _observed(ready: Prepared) -> ObservedLoop:
+    """Measure delay, centroid gain and open-loop slopes.
+
+    Raises
+    ------
+    InputError
+        When they cannot be measured.
+    """
+    loop = ready.recording
+    measured, used = measured_delay(loop)
+    delay = with_axes_of(loop, replace(used, delay_error=measured.delay_error))
+    return ObservedLoop(ready, delay, open_loop_of(loop, delay))
+
+
+def _with_winds(observed: ObservedLoop, start: Identified | None) -> tuple[LoopOfControl, Kalman]:
+    """Learn the filter of winds, for the interaction matrix as it is."""
     ready, delay, seen = observed.ready, observed.delay, observed.seen
     loop, site = ready.recording, site_of_loop(ready.recording)
     described = LoopOfControl(
@@ -518,26 +551,38 @@ def learn_observed(observed: ObservedLoop, start: Identified | None = None) -> P
         length_unit=site.length_unit,
         recorded=loop.part(slice(0, 1)).scaled(1 / loop.unit),
     )
-    plant = described.plant()
     learnt = learn_controller(
-        plant,
+        described.plant(),
         seen.telemetry,
         site,
         loop.frame_rate_hz,
         start=start,
         identification=observed.identification,
     )
-    modes = LoopInModes.of(ready, delay)
-    if not learnt.is_local:
-        share = share_of_modes(modes, learnt, plant, seen)
-        if share < _CLEARLY:
-            return _in_modes(ready, modes)
-        description = f"{learnt.description}, modes alone leave {share:.2f} of what winds leave"
-        learnt = replace(learnt, description=description)
-    described, identified = replace(described, law=modes.described.law), learnt.identified
-    if identified is not None and identified.is_layered:
-        described = replace(described, winds=np.array([wind.row() for wind in winds_of(identified)]))
-    return _controlling(described, ready, seen, learnt)
+    return described, learnt
+
+
+def _corrected(
+    observed: ObservedLoop, described: LoopOfControl, learnt: Kalman, start: Identified | None
+) -> tuple[ObservedLoop, LoopOfControl, Kalman]:
+    """Learn again with a corrected matrix, as long as the mirror has changed since it was measured."""
+    loop = observed.ready.recording
+    matrix = MovableMatrix(loop.cells, loop.interaction_matrix)
+    run = runs_of(loop.frame)
+    rows = run == np.bincount(run).argmax()
+    for _ in range(_CORRECTIONS):
+        slopes, delay = loop.slopes[rows] * (loop.unit * described.scale), described.plant().delay_frames
+        found = misregistration(slopes, loop.commands[rows], matrix, learnt.slope_predictor, delay)
+        if not found.is_wrong:
+            break
+        remarks = (*loop.remarks, *found.remarks())
+        mended = replace(loop, interaction_matrix=found.corrected(matrix), remarks=remarks)
+        try:
+            again = _observed(observed.ready._replace(recording=mended))
+        except InputError:  # the gain cannot be measured with that matrix
+            break
+        observed, (described, learnt) = again, _with_winds(again, start)
+    return observed, described, learnt
 
 
 def _in_modes(ready: Prepared, modes: LoopInModes) -> PredictiveControl:
