@@ -73,7 +73,7 @@ _LACKS = "What FILE lacks"
     "--cells",
     metavar="NAME",
     section=_LACKS,
-    help="Mask of the lenslet array, or row and column of each sub-aperture.",
+    help="Mask of the lenslet array, or row and column of each sub-aperture; none: there are none.",
     show_default="a full square",
 )
 @option("--slope-unit", metavar="UNIT", section=_LACKS, help="Unit of the slopes: px, arcsec or rad.")

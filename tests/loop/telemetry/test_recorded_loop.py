@@ -16,7 +16,9 @@ from faintspot.base.errors import InputError
 from faintspot.base.flags import SubapertureFlag
 from faintspot.io import create_writer
 from faintspot.loop.control.identification.recording import NUMBERS, Recording, prepared
+from faintspot.loop.telemetry.page import page_of_loop
 from faintspot.loop.telemetry.recorded_loop import frame_rate, read_recorded_loop
+from faintspot.loop.telemetry.report import report_of_loop
 
 WORDS = """
 slope_unit = "px"
@@ -360,3 +362,26 @@ def test_tip_tilt_of_keck(tmp_path: Path) -> None:
     ready = prepared(loop)
     assert (ready.sign, ready.sent_after_frames) == (1.0, 0)
     assert ready.loop_gain == pytest.approx(0.3, abs=0.01)
+    delay = report_of_loop(loop, compare=False).parts["loop"].values[0]
+    assert delay.value == pytest.approx(2.0, abs=3 * delay.error)
+    assert 0 < delay.error < 0.2
+
+
+def test_sensor_without_cells(tmp_path: Path) -> None:
+    """Slopes of any number and order; delay, noise and limits are reported, and no turbulence."""
+    pytest.importorskip("matplotlib")
+    pytest.importorskip("jinja2")
+    known = recorded()
+    order = np.random.default_rng(5).permutation(50)[:37]
+    arrays_ = {"slopes": known.slopes[:1200, order], "commands": known.commands[:1200]}
+    np.savez(tmp_path / "loop.npz", **arrays_, interaction_matrix=known.interaction_matrix[order])
+    stated: dict[str, Any] = {"slope_unit": "px", "frame_rate_hz": 250.0, "cells": "none"}
+    loop = read_recorded_loop(tmp_path / "loop.npz", stated=stated)
+    assert loop.cells is None
+    np.testing.assert_array_equal(loop.slopes, known.slopes[:1200, order])
+    report = report_of_loop(replace(loop, delay_frames=2.0))
+    values = {value.name: value.value for part in report.parts.values() for value in part.values}
+    assert values["noise of a slope"] == pytest.approx(0.3, rel=0.1)
+    assert not report.parts["turbulence"].values
+    assert "cells" in report.parts["choices"].missing
+    page_of_loop(report)

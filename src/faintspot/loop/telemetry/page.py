@@ -127,11 +127,19 @@ def page_of_loop(report: LoopReport, pieces: Sequence[Piece] = ()) -> Report:
         sections.append(_TEXT.section(name, _table(part), more.get(name), missing=part.missing))
     return Report(
         f"{'Loop' if loop.is_closed else 'Turbulence'} of {loop.name}",
-        {"Sub-apertures": str(len(loop.cells)), "Frame rate": f"{loop.frame_rate_hz:.6g} Hz"},
+        {**_size_of(loop), "Frame rate": f"{loop.frame_rate_hz:.6g} Hz"},
         sections,
         [report.advice] if report.advice else [],
         warnings_title="What to do",
         remark=_TEXT["remark"],
+    )
+
+
+def _size_of(loop: Recording) -> dict[str, str]:
+    return (
+        {"Slopes": f"{loop.slopes.shape[1]}"}
+        if loop.cells is None
+        else {"Sub-apertures": f"{len(loop.cells)}"}
     )
 
 
@@ -185,7 +193,7 @@ def _time_figure(pieces: Sequence[Piece]) -> FigureWithData:
 
 def _noise_figure(report: LoopReport) -> FigureWithData | None:
     """Draw the noise of each sub-aperture along x and y."""
-    if report.noise_px is None or len(report.loop.cells) == 1:
+    if report.noise_px is None or report.loop.cells is None or len(report.loop.cells) == 1:
         return None
     cells, halves = report.loop.cells - report.loop.cells.min(axis=0), report.noise_px.reshape(2, -1)
     limits, unit = {"vmin": np.nanmin(halves), "vmax": np.nanmax(halves)}, report.loop.slope_unit

@@ -46,6 +46,7 @@ _OF_SENSOR = (
 _SCALES = ("pixel_scale_arcsec", "subaperture_m", "diameter_m")
 """Scales of the telescope that a layout holds."""
 _WORDS = ("slope_unit", "slope_order", "loop")
+_NO_CELLS = "none"
 _ASKED = {
     "commands": "--commands",
     "interaction_matrix": "--interaction-matrix or --control-matrix",
@@ -89,7 +90,8 @@ def read_recorded_loop(
     path, stated = Path(path), dict(stated or {})
     if not path.exists():
         raise InputError(f"{path}: no such file or directory")
-    named = {name: f"{stated.pop(name)}" for name in _ARRAYS if isinstance(stated.get(name), str)}
+    words = {name: stated[name] for name in _ARRAYS if isinstance(stated.get(name), str)}
+    named = {name: f"{stated.pop(name)}" for name, text in words.items() if text != _NO_CELLS}
     values = _values_of(path, configuration, named)
     given = {**({} if system is None else _system_values(Path(system))), **stated}
     with errors_within(path):
@@ -128,7 +130,7 @@ def _system_values(path: Path) -> dict[str, Any]:
     values = parse_file(path)
     check_keys(f"{path}: ", values, [*_ARRAYS, *NUMBERS, *_WORDS])
     for name in _ARRAYS:
-        if name in values and isinstance(values[name], str):
+        if name in values and isinstance(values[name], str) and values[name] != _NO_CELLS:
             values[name] = read_array(path.parent / values[name])
     return values
 
@@ -281,11 +283,13 @@ def _loop(name: str, values: dict[str, Any], given: list[str]) -> Recording:
     if in_pairs and interaction is not None:
         matrix = finite_array("interaction_matrix", interaction, minimum_dimensions=2)
         interaction = np.vstack([matrix[::2], matrix[1::2]])
-    n = slopes[0].size // 2
-    if values.get("cells") is None and math.isqrt(n) ** 2 != n:
+    n, cells = slopes[0].size // 2, values.get("cells")
+    if cells is None and math.isqrt(n) ** 2 != n:
         raise InputError(
-            f"cells: unknown; give a mask, or row and column of each of the {n} sub-apertures, with --cells"
+            f"cells: unknown; give a mask, or row and column of each of the {n} sub-apertures, with --cells; "
+            f"--cells {_NO_CELLS} for a sensor without them"
         )
+    has_cells = not (isinstance(cells, str) and cells == _NO_CELLS)
     diameter_m = numbers.pop("diameter_m", None)
     known: dict[str, Any] = {**numbers, "pixel_scale_arcsec": scale}
     known["frame_rate_hz"] = rate
@@ -293,13 +297,15 @@ def _loop(name: str, values: dict[str, Any], given: list[str]) -> Recording:
         slopes,
         values.get("commands"),
         interaction,
-        cells_of(values.get("cells"), n),
+        cells_of(cells, n) if has_cells else None,
         **known,
         frame=frame,
         is_closed=one_of("loop", values.get("loop", "closed"), ("closed", "open")) == "closed",
         slope_unit=unit,
         name=name,
     )
+    if not has_cells:
+        return replace(loop, remarks=(*remarks, *_unknown(loop, values)))
     slopes, left_out = _usable(loop.slopes, values.get("flags"))
     remarks += [f"slopes: {left_out}"] if left_out else []
     side = side_m(loop.cells, loop.subaperture_m, diameter_m, values.get("flags"))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
@@ -14,6 +15,7 @@ from faintspot.base.errors import InputError
 from faintspot.base.report.texts import Texts
 from faintspot.loop.control.identification.layers import Identification, Identified
 from faintspot.loop.control.identification.loop_delay import FEWEST_SUBAPERTURES, LoopDelay
+from faintspot.loop.control.identification.modal_loop import modes_of
 from faintspot.loop.control.identification.open_loop import (
     R0,
     Measured,
@@ -127,10 +129,8 @@ def report_of_loop(
     Raises
     ------
     InputError
-        When the slopes do not vary, commands and slopes are not of one loop, or there are no cells.
+        When the slopes do not vary, or commands and slopes are not of one loop.
     """
-    if loop.cells is None:
-        raise InputError("cells: expected row and column of each sub-aperture for a report, got none")
     ready = prepared(loop)
     parts = {name: Part(_TEXT[f"{name}.title"]) for name in _PARTS}
     report = LoopReport(ready.recording, parts)
@@ -188,14 +188,21 @@ def _delay(report: LoopReport) -> tuple[list[Measured], LoopDelay]:
     """Return delay and gain as reported and as used."""
     loop = report.loop
     names, assumed = (("delay", "frames"), ("centroid gain", "")), loop.delay_frames
-    fit, used, unknown = known_delay(loop)
+    in_modes, fitted = loop.cells is None or len(loop.cells) < FEWEST_SUBAPERTURES, loop
+    if in_modes:
+        with suppress(InputError):  # the reason is that of the delay, which then is not known either
+            fitted = modes_of(loop).recording
+    fit, used, unknown = known_delay(fitted)
     if unknown:
         remarks = f"{unknown}; {used.delay_frames:g} is used", f"{unknown}; 1 is used"
         return [Measured(*name, remark=text) for name, text in zip(names, remarks, strict=True)], used
     remark = "given" if assumed is not None else f"{used.delay_frames:g} is used" if used is not fit else ""
-    used = with_axes_of(loop, used)
-    report.delay = replace(used, delay_error=fit.delay_error)
+    if not in_modes:
+        used = with_axes_of(loop, used)
+        report.delay = replace(used, delay_error=fit.delay_error)
     gain = Measured(*names[1], used.gain, used.gain_error, f"for a delay of {used.delay_frames:.3g} frames")
+    if in_modes:
+        return [Measured(*names[0], fit.delay_frames, fit.delay_error, remark), gain], used
     of_axes = used.measured_x_to_y, used.x_to_y_error
     axes = Measured("centroid gain of x relative to y", "", *of_axes, f"{used.x_to_y:.3g} is used")
     return [Measured(*names[0], fit.delay_frames, fit.delay_error, remark), gain, axes], used
@@ -233,14 +240,14 @@ def _noise(report: LoopReport, delay: LoopDelay) -> OpenLoop | None:
     if not known.any():
         part.missing = "No slope was measured in five consecutive frames."
         return open_loop
-    report.noise_px = np.where(
-        known, loop.unit * delay.gains(len(loop.cells)) * np.sqrt(open_loop.variance), np.nan
-    )
+    gains = delay.gain if loop.cells is None else delay.gains(len(loop.cells))
+    report.noise_px = np.where(known, loop.unit * gains * np.sqrt(open_loop.variance), np.nan)
     report.noise_error_px = 0.5 * report.noise_px * open_loop.variance_error
     rms = float(np.sqrt(np.square(report.noise_px[known]).mean()))
     spread = 0.5 * rms * float(open_loop.variance_error[known].mean()) / math.sqrt(known.sum())
     spread = math.hypot(spread, _PARABOLA_ERROR * rms)
-    remark = "rms over the sub-apertures"
+    of_spectra = "rms over the slopes, from where their spectra are flat"
+    remark = of_spectra if loop.cells is None else "rms over the sub-apertures"
     part.values.append(Measured("noise of a slope", loop.slope_unit, rms, spread, remark))
     scale = loop.pixel_scale_arcsec
     if scale is None or loop.subaperture_m is None:
@@ -248,6 +255,9 @@ def _noise(report: LoopReport, delay: LoopDelay) -> OpenLoop | None:
     else:
         to_nm = scale / loop.unit * ARCSEC * loop.subaperture_m * 1e9
         part.values.append(Measured("tilt over a sub-aperture", "nm", rms * to_nm, spread * to_nm, remark))
+    if loop.cells is None:
+        for name in ("turbulence", "vibrations", "spectra", "choices"):
+            report.parts[name].missing = report.parts[name].missing or _TEXT["without_cells"]
     unmeasured = 1 - float(open_loop.telemetry.trust[open_loop.telemetry.trust.any(axis=1)].mean())
     if unmeasured > _MOST_UNMEASURED:
         why = f"{unmeasured:.0%} of the slopes were not measured, more than {_MOST_UNMEASURED:.0%}."
