@@ -22,14 +22,10 @@ from benchmarks.measuring import Row, Table
 from faintspot.base.statistics import paired_mean
 from faintspot.loop.control.flattening import residual_phase
 from faintspot.loop.control.identification.layers import Identified
+from faintspot.loop.control.identification.learnt_loop import ObservedLoop, learn_observed
 from faintspot.loop.control.identification.loop_delay import LoopDelay
 from faintspot.loop.control.identification.open_loop import open_loop_of
-from faintspot.loop.control.identification.predictive_control import (
-    ObservedLoop,
-    PredictiveControl,
-    learn,
-    learn_observed,
-)
+from faintspot.loop.control.identification.predictive_control import PredictiveControl, learn
 from faintspot.loop.control.identification.recording import Recording, prepared
 from faintspot.loop.control.reconstructor import make_reconstructor
 from faintspot.loop.turbulence.slope_covariance import ARCSEC
@@ -235,7 +231,9 @@ def learnt(
     """Return the filter that assumes a wrong centroid gain."""
     delay = LoopDelay(float(DELAY), 0.06, factor * CENTROID_GAIN, 0.04)
     ready = prepared(recorded(flux_e, loop_gain))
-    return learn_observed(ObservedLoop(ready, delay, open_loop_of(ready.recording, delay)), start)
+    return PredictiveControl(
+        *learn_observed(ObservedLoop(ready, delay, open_loop_of(ready.recording, delay)), start)
+    )
 
 
 def run() -> list[Table]:

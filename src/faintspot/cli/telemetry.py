@@ -174,11 +174,11 @@ def command(
         click.echo(report.advice)
     click.echo(f"{page}: open it in a browser; {numbers} has the numbers")
     if controller is not None:
-        from faintspot.loop.control.identification.predictive_control import learn, learn_observed
+        from faintspot.loop.control.identification.predictive_control import PredictiveControl, learn
 
         click.echo("controller ...", err=True)
         with errors_within(f"{controller}: not written, keep the integrator"):
-            control = learn(loop) if report.observed is None else learn_observed(report.observed)
+            control = learn(loop) if report.observed is None else PredictiveControl.of(report.observed)
         control.save(controller)
         click.echo(f"{controller}: {control.summary()}")
 

@@ -36,7 +36,7 @@ from faintspot.slopes.sensor.pupil import subapertures_across
 from faintspot.slopes.spots.von_karman import R0_WAVELENGTH_M
 
 if TYPE_CHECKING:
-    from faintspot.loop.control.identification.predictive_control import ObservedLoop
+    from faintspot.loop.control.identification.learnt_loop import ObservedLoop
     from faintspot.loop.telemetry.choices import ControlChoice
 
 Floats = NDArray[np.float64]
@@ -143,7 +143,7 @@ def report_of_loop(
         progress("turbulence")
         identification = _turbulence(report, open_loop, delay)
         if report.delay is not None and identification is not None:
-            from faintspot.loop.control.identification.predictive_control import ObservedLoop
+            from faintspot.loop.control.identification.learnt_loop import ObservedLoop
 
             report.observed = ObservedLoop(ready, report.delay, open_loop, identification)
         if compare:

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -16,31 +15,23 @@ from faintspot.base.checks import one_of, real_array
 from faintspot.base.errors import InputError
 from faintspot.base.files import read_arrays, save_arrays
 from faintspot.loop.control.base import SETTLE_FRAMES, CommandDelayLine
-from faintspot.loop.control.identification.controlled_loop import LoopInModes, LoopOfControl
-from faintspot.loop.control.identification.layers import Identification, Identified
+from faintspot.loop.control.identification.controlled_loop import LoopOfControl
+from faintspot.loop.control.identification.layers import Identified
 from faintspot.loop.control.identification.learning import (
     JUDGED_PART,
     STANDARD_ERRORS,
     error_of_mean,
-    learn_controller,
 )
-from faintspot.loop.control.identification.loop_delay import FEWEST_SUBAPERTURES, LoopDelay
-from faintspot.loop.control.identification.misregistration import MovableMatrix, misregistration
-from faintspot.loop.control.identification.modal_loop import LEAST_MEASURED, modes_of
-from faintspot.loop.control.identification.modal_model import learn_modes, share_of_modes
+from faintspot.loop.control.identification.learnt_loop import ObservedLoop, learn_loop, learn_observed
+from faintspot.loop.control.identification.loop_delay import LoopDelay
+from faintspot.loop.control.identification.modal_loop import LEAST_MEASURED
 from faintspot.loop.control.identification.model import Kalman, state_space, write_matrices
 from faintspot.loop.control.identification.open_loop import (
     Measured,
-    OpenLoop,
     Wind,
-    measured_delay,
     open_loop_of,
-    runs_of,
-    site_of_loop,
-    winds_of,
-    with_axes_of,
 )
-from faintspot.loop.control.identification.recording import Prepared, Recording, prepared
+from faintspot.loop.control.identification.recording import Recording
 from faintspot.loop.control.identification.relearning import (
     FRAMES,
     STORED,
@@ -50,19 +41,13 @@ from faintspot.loop.control.identification.relearning import (
     restored,
     stored,
 )
-from faintspot.loop.control.integrator import LoopPlant
 
 Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]
 
 _MEASURED_FRAMES = 60  # that the integrator drives the mirror first, so that its residual is measured
-_MOST_SIGMAS = 5.0  # of the commands that the turbulence asks for
-_MOST_OFF = 1.5  # ratio of the recorded gain and the advised one, above which the fallback has the latter
 _EASED_FRAMES = 100  # in which it gets there
-_MARGIN = 0.55  # of the largest stable loop gain, for the largest centroid gain that is likely
 _ABSURD = 1e3  # of the rms of recorded slopes: no such slope is measured
-_CLEARLY = 0.99  # part of what winds leave, below which modes alone replace them
-_CORRECTIONS = 2  # of the matrix, each followed by learning
 _CONTENTS = "a predictive controller"
 _RELEARNT_FROM = 750  # frames since the integrator took over, from which is learnt in the background
 _PLAIN_AT_FIRST = 200  # frames in which it may drive because the filter has just begun
@@ -91,6 +76,11 @@ class PredictiveControl:
         self._recent = RecentFrames(len(loop.scale), loop.interaction.shape[1])
         self._beside: BesideTheLoop[tuple[PredictiveControl | None, str]] | None = None
         self.reset()
+
+    @classmethod
+    def of(cls, observed: ObservedLoop) -> PredictiveControl:
+        """Learn a controller from a recording whose delay and open-loop slopes are known."""
+        return cls(*learn_observed(observed))
 
     @property
     def delay_frames(self) -> Measured:
@@ -479,156 +469,4 @@ def learn(recording: Recording, start: Identified | None = None) -> PredictiveCo
     >>> control(slopes[0]).shape
     (16,)
     """
-    if recording.commands is None or recording.interaction_matrix is None:
-        absent = "commands" if recording.commands is None else "interaction_matrix"
-        raise InputError(f"{absent}: expected an array, got none")
-    ready = prepared(recording)
-    loop = ready.recording
-    if loop.cells is None or len(loop.cells) < FEWEST_SUBAPERTURES:
-        measured, used = measured_delay(modes_of(loop).recording)
-        return _in_modes(ready, LoopInModes.of(ready, replace(used, delay_error=measured.delay_error)))
-    return learn_observed(_observed(ready), start)
-
-
-@dataclass(frozen=True, eq=False)
-class ObservedLoop:
-    """Recording, and what has been measured from it."""
-
-    ready: Prepared
-    delay: LoopDelay
-    """Delay and centroid gain that are used, with their errors."""
-    seen: OpenLoop
-    identification: Identification | None = None
-    """Identification of its open-loop slopes, if made already."""
-
-
-def learn_observed(observed: ObservedLoop, start: Identified | None = None) -> PredictiveControl:
-    """Learn as `learn` from a recording whose delay and open-loop slopes are known."""
-    described, learnt = _with_winds(observed, start)
-    if not learnt.is_local:
-        observed, described, learnt = _corrected(observed, described, learnt, start)
-    ready, seen, modes = observed.ready, observed.seen, LoopInModes.of(observed.ready, observed.delay)
-    if not learnt.is_local:
-        share = share_of_modes(modes, learnt, described.plant(), seen)
-        if share < _CLEARLY:
-            return _in_modes(ready, modes)
-        description = f"{learnt.description}, modes alone leave {share:.2f} of what winds leave"
-        learnt = replace(learnt, description=description)
-    described, identified = replace(described, law=modes.described.law), learnt.identified
-    if identified is not None and identified.is_layered:
-        described = replace(described, winds=np.array([wind.row() for wind in winds_of(identified)]))
-    return _controlling(described, ready, seen, learnt)
-
-
-def _observed(ready: Prepared) -> ObservedLoop:
-    """Measure delay, centroid gain and open-loop slopes.
-
-    Raises
-    ------
-    InputError
-        When they cannot be measured.
-    """
-    loop = ready.recording
-    measured, used = measured_delay(loop)
-    delay = with_axes_of(loop, replace(used, delay_error=measured.delay_error))
-    return ObservedLoop(ready, delay, open_loop_of(loop, delay))
-
-
-def _with_winds(observed: ObservedLoop, start: Identified | None) -> tuple[LoopOfControl, Kalman]:
-    """Learn the filter of winds, for the interaction matrix as it is."""
-    ready, delay, seen = observed.ready, observed.delay, observed.seen
-    loop, site = ready.recording, site_of_loop(ready.recording)
-    described = LoopOfControl(
-        loop.interaction_matrix,
-        np.where(np.isfinite(loop.slopes).any(axis=0), np.sqrt(seen.variance), np.inf),
-        1 / (loop.unit * delay.gains(len(loop.cells))),
-        ready.sign,
-        delay.row(),
-        np.zeros((0, 6)),
-        math.inf,
-        math.nan,
-        ready.sent_after_frames,
-        length_unit=site.length_unit,
-        recorded=loop.part(slice(0, 1)).scaled(1 / loop.unit),
-    )
-    learnt = learn_controller(
-        described.plant(),
-        seen.telemetry,
-        site,
-        loop.frame_rate_hz,
-        start=start,
-        identification=observed.identification,
-    )
-    return described, learnt
-
-
-def _corrected(
-    observed: ObservedLoop, described: LoopOfControl, learnt: Kalman, start: Identified | None
-) -> tuple[ObservedLoop, LoopOfControl, Kalman]:
-    """Learn again with a corrected matrix, as long as the mirror has changed since it was measured."""
-    loop = observed.ready.recording
-    matrix = MovableMatrix(loop.cells, loop.interaction_matrix)
-    run = runs_of(loop.frame)
-    rows = run == np.bincount(run).argmax()
-    for _ in range(_CORRECTIONS):
-        slopes, delay = loop.slopes[rows] * (loop.unit * described.scale), described.plant().delay_frames
-        found = misregistration(slopes, loop.commands[rows], matrix, learnt.slope_predictor, delay)
-        if not found.is_wrong:
-            break
-        remarks = (*loop.remarks, *found.remarks())
-        mended = replace(loop, interaction_matrix=found.corrected(matrix), remarks=remarks)
-        try:
-            again = _observed(observed.ready._replace(recording=mended))
-        except InputError:  # the gain cannot be measured with that matrix
-            break
-        observed, (described, learnt) = again, _with_winds(again, start)
-    return observed, described, learnt
-
-
-def _in_modes(ready: Prepared, modes: LoopInModes) -> PredictiveControl:
-    """Learn from modes alone."""
-    learnt = learn_modes(modes.described.plant(), modes.seen.telemetry)
-    return _controlling(modes.described, ready, modes.seen, learnt)
-
-
-def _controlling(
-    described: LoopOfControl, ready: Prepared, seen: OpenLoop, learnt: Kalman
-) -> PredictiveControl:
-    """Return the control of a learnt filter, with its fallback and stroke limit."""
-    loop, plant, gain = ready.recording, described.plant(), float(described.delay[2])
-    advised = _advised_gain(learnt.plain_gain, gain, float(described.delay[3]), plant.delay_frames)
-    recorded, remarks = ready.loop_gain, list(loop.remarks)
-    plain = recorded if math.isfinite(recorded) else advised
-    if abs(math.log(max(plain, 1e-9) / advised)) > math.log(_MOST_OFF):
-        plain = advised
-        described = replace(described, recorded_gain=max(recorded, 1e-9) * gain)
-        remarks.append(f"fallback integrator: gain {advised:.2g}, as the recorded {recorded:.2g} leaves more")
-    described = replace(
-        described, largest_command=_largest_command(loop, seen, plant), integrator_gain=advised
-    )
-    description = "; ".join([learnt.description, *remarks])
-    return PredictiveControl(described, replace(learnt, plain_gain=plain * gain, description=description))
-
-
-def _advised_gain(best: float, gain: float, gain_error: float, delay_frames: int) -> float:
-    """Return the loop gain on slopes as measured: the best by replay, or less, as it must be stable.
-
-    Parameters
-    ----------
-    best : float
-        Of slopes divided by the centroid gain.
-    gain, gain_error : float
-        Centroid gain.
-    delay_frames : int
-        Whole frames; an integrator is stable up to 2 sin(pi / (4 delay - 2)).
-    """
-    most = _MARGIN * 2 * math.sin(math.pi / (4 * delay_frames - 2))
-    return min(best / gain, most / (gain + (gain_error if math.isfinite(gain_error) else 0.0)))
-
-
-def _largest_command(loop: Recording, seen: OpenLoop, plant: LoopPlant) -> float:
-    """Return the stroke limit: the loop's, or 5 sigma of what the recorded wavefront asks for."""
-    asked = seen.telemetry.open_loop_px @ plant.reconstructor.matrix.T
-    static = np.abs(loop.commands.mean(axis=0)) * loop.interaction_matrix.any(axis=0)
-    limit = float((static + _MOST_SIGMAS * asked.std(axis=0)).max())
-    return limit if loop.largest_command is None else min(limit, loop.largest_command)
+    return PredictiveControl(*learn_loop(recording, start))
