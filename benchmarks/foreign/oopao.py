@@ -37,6 +37,9 @@ class OopaoCase:
     lenslet_px: int = 12
     diameter_m: float = 4.2
     rate_hz: float = 250.0
+    fault: str = ""
+    """Change since the matrix was measured: "moved" (0.3 sub-apertures and 5 degrees), "dead" (one actuator),
+    "columns" (gains of commands between 0.5 and 1.5)."""
 
 
 class OopaoLoop(SteppedLoop):
@@ -78,14 +81,34 @@ class OopaoLoop(SteppedLoop):
             camera = fs.Calibration(dark=0.0, read_noise_e=case.read_noise_e)
             self._wfs.cam.photonNoise, self._wfs.cam.readoutNoise = False, 0
             oopao.attach(self._wfs, settings, camera, psf=fs.PSF.analytic("diffraction", size=1.0))
-        self._pupil = self._telescope.pupil.astype(bool)
+        self._pupil, self._factors = self._telescope.pupil.astype(bool), np.ones(self._mirror.nValidAct)
         self.cells = np.argwhere(self._wfs.valid_subapertures)
         pokes, self._tilt_of_signal = self._calibrate()
         self.interaction = pokes
         self.unit_arcsec = points / case.diameter_m / self._tilt_of_signal / ARCSEC
         with _quiet():
             vault = CalibrationVault(pokes, nTrunc=_TRUNCATED)
-        self.own = {"OOPAO's truncated inverse": np.asarray(vault.Mtrunc)}
+        self.own = {} if case.fault else {"OOPAO's truncated inverse": np.asarray(vault.Mtrunc)}
+        self._break()
+
+    def _break(self) -> None:
+        """Change the mirror as the case says."""
+        from OOPAO.DeformableMirror import DeformableMirror
+        from OOPAO.MisRegistration import MisRegistration
+
+        actuators = self._mirror.nValidAct
+        if self._case.fault == "dead":
+            self._factors[actuators // 2 + 3] = 0.0
+        elif self._case.fault == "columns":
+            self._factors = np.random.default_rng(0).uniform(0.5, 1.5, actuators)
+        elif self._case.fault == "moved":
+            with _quiet():
+                change = MisRegistration()
+                change.shiftX, change.shiftY = 0.3 * self.subaperture_m * np.array([np.cos(1), np.sin(1)])
+                change.rotationAngle = 5.0
+                self._mirror = DeformableMirror(
+                    self._telescope, nSubap=self._case.lenslets, mechCoupling=0.35, misReg=change
+                )
 
     def _calibrate(self) -> tuple[Floats, float]:
         """Return the interaction matrix, and the gain of slopes relative to true gradients."""
@@ -101,7 +124,7 @@ class OopaoLoop(SteppedLoop):
     def _measured(self, command: Floats, path_m: Any = 0.0) -> Floats:
         from OOPAO.OPD_map import OPD_map
 
-        self._mirror.coefs = command
+        self._mirror.coefs = self._factors * command
         screen = OPD_map(np.zeros(self._pupil.shape) + path_m)
         self._star**self._telescope * screen * self._mirror * self._wfs
         return np.array(self._wfs.signal)

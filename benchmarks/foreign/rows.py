@@ -57,6 +57,7 @@ def _soapy(folder: Path, brightness: float) -> ForeignLoop:
 
 
 _FIRST = OopaoCase("first")
+_MOVED, _DEAD, _COLUMNS = (OopaoCase(fault, fault=fault) for fault in ("moved", "dead", "columns"))
 _LARGE = OopaoCase("large", lenslets=16, lenslet_px=6, diameter_m=8.0, rate_hz=500.0)
 ROWS = (
     Row("oopao-20", "r0 0.25 m, 20 e-, 3 e- read noise", partial(_oopao, _FIRST), 0.73),
@@ -72,6 +73,14 @@ ROWS = (
         "oopao-delay3", "the first, delay of 3 frames", partial(_oopao, OopaoCase("3", delay_frames=3)), 0.70
     ),
     Row("oopao-delay1", "the first, delay of 1 frame", partial(_oopao, OopaoCase("1", delay_frames=1))),
+    Row(
+        "oopao-moved",
+        "the first, mirror moved by 0.3 sub-apertures, 5 degrees",
+        partial(_oopao, _MOVED),
+        0.68,
+    ),
+    Row("oopao-dead", "the first, a dead actuator", partial(_oopao, _DEAD), 0.70),
+    Row("oopao-columns", "the first, gains of commands 0.5 to 1.5", partial(_oopao, _COLUMNS), 0.70),
     Row("oopao-turned", "the first, winds reversed after learning", partial(_oopao, _FIRST), turned=True),
     Row("specula-40", "27 Zernikes, three winds, 40 e-", partial(_specula, 40.0, False), 0.70),
     Row("specula-20", "27 Zernikes, three winds, 20 e-", partial(_specula, 20.0, False), 0.65),
