@@ -22,7 +22,7 @@ from benchmarks.measuring import Row, Table
 from benchmarks.prediction import Case, Make, rivals
 from faintspot.base.statistics import paired_mean
 from faintspot.loop.control.base import OpenLoopTelemetry
-from faintspot.loop.control.identification import learning
+from faintspot.loop.control.identification import model
 from faintspot.loop.control.identification.learning import GAINS
 from faintspot.loop.simulation import LoopConfiguration
 
@@ -93,7 +93,7 @@ def _table(name: str, case: Large) -> Table:
         if each == ALL and (case.name != "diffraction_limit" or not _DENSE):
             continue
         begun = time.process_time()
-        with mock.patch.object(learning, "_MOST_SLOPES", most_slopes):
+        with mock.patch.object(model, "MOST_SLOPES", most_slopes):
             learnt = case.learnt(learnt_from)
         makes[each], seconds[each] = partial(learnt.guarded, case.plant), time.process_time() - begun
         print(f"{name}, {each}: {learnt.description}", flush=True)

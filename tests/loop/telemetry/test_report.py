@@ -276,7 +276,8 @@ def test_a_single_sub_aperture() -> None:
         frame_rate_hz=500.0,
     )
     found = report_of_loop(loop)
-    assert math.isnan(value(found, "loop", "delay").value)
+    delay = value(found, "loop", "delay")
+    assert abs(delay.value - 2) < 3 * delay.error < 0.6
     assert not found.parts["turbulence"].values
     assert found.parts["turbulence"].missing
     assert value(found, "vibrations", "frequency of tip").value == pytest.approx(20.0, abs=0.3)

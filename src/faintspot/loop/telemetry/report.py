@@ -277,6 +277,7 @@ def _turbulence(report: LoopReport, open_loop: OpenLoop, delay: LoopDelay) -> Id
         part.missing = report.parts["vibrations"].missing = report.parts["spectra"].missing = str(error)
         return None
     report.turbulence = identified
+    _mirror(report, open_loop, identified)
     report.spectra = modal_spectra(open_loop.telemetry, identified)
     _vibrations(report, identified)
     if len(loop.cells) < FEWEST_SUBAPERTURES:
@@ -292,6 +293,23 @@ def _turbulence(report: LoopReport, open_loop: OpenLoop, delay: LoopDelay) -> Id
         return identification
     part.values += _winds(identified, next(value for value in strength if value.name == R0))
     return identification
+
+
+def _mirror(report: LoopReport, open_loop: OpenLoop, identified: Identified) -> None:
+    """Report the change of the mirror since its matrix was measured, of up to 300 slopes."""
+    loop, delay = report.loop, report.delay
+    if delay is None or loop.interaction_matrix is None:
+        return
+    from faintspot.loop.control.identification.misregistration import MovableMatrix, misregistration
+    from faintspot.loop.control.kalman.predictor import MOST_SLOPES, SlopePredictor
+
+    if len(open_loop.variance) > MOST_SLOPES:
+        return
+
+    noise = identified.noise_factor * open_loop.variance
+    matrix = MovableMatrix(loop.cells, loop.interaction_matrix)
+    found = misregistration(loop, delay, matrix, SlopePredictor(identified.slope_model(), noise))
+    report.parts["loop"].values += found.measured()
 
 
 def _strength(

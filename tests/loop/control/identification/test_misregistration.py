@@ -10,7 +10,7 @@ from tests.loop.telemetry.loop_cases import AIR, CELLS, CORNERS, RATE_HZ
 from faintspot.loop.control.identification.misregistration import (
     Misregistration,
     MovableMatrix,
-    misregistration,
+    change_of_mirror,
 )
 from faintspot.loop.control.kalman.predictor import SlopeModel, SlopePredictor
 from faintspot.loop.control.reconstructor import make_reconstructor
@@ -52,7 +52,7 @@ def found(true: np.ndarray) -> Misregistration:
         noise = NOISE_PX * rng.standard_normal(len(known))
         slopes[frame] = open_loop[frame] + true @ commands[frame - 2] + noise
         commands[frame] = 0.99 * commands[frame - 1] - 0.3 * inverse @ slopes[frame]
-    return misregistration(slopes, commands, MovableMatrix(CELLS, known), predictor, 2)
+    return change_of_mirror(slopes, commands, MovableMatrix(CELLS, known), predictor, 2)
 
 
 @pytest.mark.parametrize("moved", [(0.3, -0.1, 0.0, 0.0), (0.0, 0.2, 0.09, 0.0), (0.0, 0.0, 0.0, 0.1)])

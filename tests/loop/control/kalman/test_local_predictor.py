@@ -240,7 +240,7 @@ def test_it_begins_with_given_slopes_and_looks_ahead(arrays: dict[str, Any]) -> 
 
 def test_large_sensors_learn_it(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """Learnt, saved and read again it sends the same commands, and leaves less than the integrator."""
-    monkeypatch.setattr(models, "_MOST_SLOPES", 10)
+    monkeypatch.setattr(models, "MOST_SLOPES", 10)
     frames = telemetry(600, 0.3, model=LAYERS)
     shown: list[tuple[int, int]] = []
     learnt = learn_controller(

@@ -23,7 +23,6 @@ from faintspot.loop.control.identification.open_loop import (
     OpenLoop,
     measured_delay,
     open_loop_of,
-    runs_of,
     site_of_loop,
     winds_of,
     with_axes_of,
@@ -131,11 +130,8 @@ def _corrected(
     """Learn again with a corrected matrix, as long as the mirror has changed since it was measured."""
     loop = observed.ready.recording
     matrix = MovableMatrix(loop.cells, loop.interaction_matrix)
-    run = runs_of(loop.frame)
-    rows = run == np.bincount(run).argmax()
     for _ in range(_CORRECTIONS):
-        slopes, delay = loop.slopes[rows] * (loop.unit * described.scale), described.plant().delay_frames
-        found = misregistration(slopes, loop.commands[rows], matrix, learnt.slope_predictor, delay)
+        found = misregistration(loop, observed.delay, matrix, learnt.slope_predictor)
         if not found.is_wrong:
             break
         remarks = (*loop.remarks, *found.remarks())

@@ -17,6 +17,9 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.linalg import splu
 
+from faintspot.loop.control.identification.loop_delay import LoopDelay
+from faintspot.loop.control.identification.open_loop import Measured, runs_of
+from faintspot.loop.control.identification.recording import Recording
 from faintspot.loop.control.identification.slope_spectra import interpolated
 from faintspot.loop.control.kalman.predictor import SlopePredictor
 
@@ -76,6 +79,17 @@ class Misregistration:
     def corrected(self, matrix: MovableMatrix) -> Floats:
         """Return the corrected matrix."""
         return matrix.at(self.moved if self.has_moved else np.zeros(4)) * self.factors
+
+    def measured(self) -> list[Measured]:
+        """Return shifts, rotation and magnification with their errors."""
+        names = "mirror moved along x", "mirror moved along y", "mirror turned", "mirror magnified"
+        units, factors = ("sub-apertures", "sub-apertures", "degrees", "%"), (1, 1, math.degrees(1), 100)
+        return [
+            Measured(name, unit, float(factor * value), float(factor * error))
+            for name, unit, factor, value, error in zip(
+                names, units, factors, self.moved, self.error, strict=True
+            )
+        ]
 
     def remarks(self) -> list[str]:
         """Return what is corrected, a line each."""
@@ -170,6 +184,28 @@ def _roughness(rows: int, columns: int) -> sparse.csr_array:
 
 
 def misregistration(
+    loop: Recording, delay: LoopDelay, matrix: MovableMatrix, predictor: SlopePredictor
+) -> Misregistration:
+    """Measure the change of a mirror, from the longest run of a closed loop without a gap.
+
+    Parameters
+    ----------
+    loop : Recording
+        As `prepared`.
+    delay : LoopDelay
+        Its delay and centroid gain.
+    matrix : MovableMatrix
+        As it was measured.
+    predictor : SlopePredictor
+        Filter of the open-loop slopes.
+    """
+    run, frames = runs_of(loop.frame), max(1, round(delay.delay_frames))
+    rows = np.flatnonzero(run == np.bincount(run).argmax())[-_MOST_FRAMES - frames :]
+    slopes = loop.slopes[rows] / delay.gains(len(loop.cells))
+    return change_of_mirror(slopes, loop.commands[rows], matrix, predictor, frames)
+
+
+def change_of_mirror(
     slopes: Floats, commands: Floats, matrix: MovableMatrix, predictor: SlopePredictor, delay: int
 ) -> Misregistration:
     """Measure the change of a mirror from consecutive frames of a closed loop.
@@ -182,11 +218,9 @@ def misregistration(
         Computed from the same frames.
     matrix : MovableMatrix
     predictor : SlopePredictor
-        Filter of the open-loop slopes.
     delay : int
         Frames.
     """
-    slopes, commands = slopes[-_MOST_FRAMES - delay :], commands[-_MOST_FRAMES - delay :]
     acting = commands[:-delay] - commands[:-delay].mean(axis=0)
     measured = np.isfinite(slopes)
     known = np.asarray(measured.any(axis=0))

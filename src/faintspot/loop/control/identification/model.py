@@ -32,7 +32,7 @@ from faintspot.loop.control.kalman.local_model import STEPS, slopes_ahead, state
 from faintspot.loop.control.kalman.local_predictor import LocalPredictor, local_filter, local_shapes
 from faintspot.loop.control.kalman.modal_predictor import ARRAYS as MODAL
 from faintspot.loop.control.kalman.modal_predictor import ModalPredictor
-from faintspot.loop.control.kalman.predictor import SlopeModel, SlopePredictor, steady_covariance
+from faintspot.loop.control.kalman.predictor import MOST_SLOPES, SlopeModel, SlopePredictor, steady_covariance
 from faintspot.loop.control.replay import mean_residual
 
 if TYPE_CHECKING:
@@ -40,7 +40,6 @@ if TYPE_CHECKING:
 
 Floats = NDArray[np.float64]
 
-_MOST_SLOPES = 300  # whose filter lets each correct all others
 _LAYERS = "first", "second", "driving_px2"
 _NOISE = "variance_px2", "covariance_xy_px2"
 _LOCAL = "near", "around", "weights", "corrections", "variance_px2", "predicted_px2", "share"
@@ -116,7 +115,7 @@ class Kalman:
 
         def with_filter(fit: Identified) -> Kalman:
             variance, covariance = usual_noise(telemetry.scaled(fit.noise_factor))
-            if len(variance) > _MOST_SLOPES:
+            if len(variance) > MOST_SLOPES:
                 arrays = local_filter(fit.layers, 1 / fit.rate_hz, variance, advance, covariance)
             else:
                 slopes = fit.slope_model()

@@ -18,6 +18,10 @@ _RIDGE = 1e-4  # of a slope's variance: what noise-free theory would demand of s
 _LEAST_DRIVING = 1e-6  # of a slope's variance
 
 
+MOST_SLOPES = 300
+"""Slopes of a sensor whose filter lets each correct all others; of more, near ones alone."""
+
+
 @dataclass(frozen=True, eq=False)
 class SlopeModel:
     """z[k] = sum over layers of y[k]; y[k + 1] = first y[k] + second y[k - 1] + e[k], E[e e^T] = driving.
