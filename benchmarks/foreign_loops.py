@@ -114,10 +114,13 @@ def _measure(row: Row, effort: Effort, cache: Path, path: Path) -> None:
 
     try:
         ready = evaluation.commissioned(runs(1.0), _log)
-        result |= (evaluation.turned if row.turned else evaluation.compared)(ready, _log)
+        evaluate = (
+            evaluation.changed if row.changed else evaluation.turned if row.turned else evaluation.compared
+        )
+        result |= evaluate(ready, _log)
         result |= {"learnt": evaluation.learnt(ready), "gains": ready.tried}
         store()
-        if ready.runs.effort.with_others and not row.turned:
+        if ready.runs.effort.with_others and not (row.turned or row.changed):
             result["magnitudes"] = in_magnitudes(result["scores"], runs, INTEGRATOR, ready.gain, _log)
     except Exception as error:
         traceback.print_exc()

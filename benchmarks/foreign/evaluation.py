@@ -14,6 +14,7 @@ import numpy as np
 import faintspot as fs
 from benchmarks.foreign import reports, rivals
 from benchmarks.foreign.base import SETTLE_FRAMES, Control, Floats, ForeignLoop, Integrator, Observed
+from benchmarks.foreign.oopao import CHANGED_AFTER
 from faintspot.base.statistics import paired_mean
 from faintspot.loop.control.reconstructor import make_reconstructor
 from faintspot.loop.telemetry.choices import FILTER
@@ -234,6 +235,56 @@ def turned(ready: Commissioned, log: Log) -> dict[str, Any]:
     }
     log(f"{ahead}, switched {switched}")
     return {"parts": scores, "ahead_of_parts": ahead, "switched_after_frames": switched}
+
+
+def changed(ready: Commissioned, log: Log) -> dict[str, Any]:
+    """Score integrator and filter after other winds, with the control learning again beside the loop.
+
+    Frames have the pace of the loop, as learning takes its time.
+    """
+    loop, rate, begin = ready.loop, round(ready.loop.rate_hz), CHANGED_AFTER
+    parts = {
+        "before": slice(SETTLE_FRAMES, begin),
+        "first second": slice(begin, begin + rate),
+        "until 15 s": slice(begin + rate, begin + 15 * rate),
+        "from 15 s on": slice(begin + 15 * rate, begin + 18 * rate),
+    }
+    scores: dict[str, dict[str, list[float]]] = {part: {INTEGRATOR: [], FILTER: []} for part in parts}
+    for seed in ready.runs.effort.seeds:
+        control = ready.fresh()
+        control.relearn = "background"
+        both = {
+            INTEGRATOR: loop.run(ready.integrator(), seed, begin + 18 * rate),
+            FILTER: loop.run(_Paced(control, loop.rate_hz), seed, begin + 18 * rate),
+        }
+        log(f"seed {seed}: {control.relearnt}")
+        for name, run in both.items():
+            for part, rows in parts.items():
+                scores[part][name].append(float(run.strehl[rows].mean()))
+        ready.control = fs.control.learn(recording_of(loop, ready.learning))
+    ahead = {
+        part: {INTEGRATOR: _ahead(values[FILTER], values[INTEGRATOR])} for part, values in scores.items()
+    }
+    log(f"{scores}, {ahead}")
+    return {"parts": scores, "ahead_of_parts": ahead}
+
+
+class _Paced:
+    """Control whose frames come at the rate of the loop, or later."""
+
+    def __init__(self, control: Any, rate_hz: float) -> None:
+        self._control, self._period_s, self._next_s = control, 1 / rate_hz, time.perf_counter()
+
+    @property
+    def is_predicting(self) -> bool:
+        """Whether the filter drives."""
+        return bool(self._control.is_predicting)
+
+    def __call__(self, slopes: Floats) -> Floats:
+        """Wait for the frame, and return its command."""
+        time.sleep(max(0.0, self._next_s - time.perf_counter()))
+        self._next_s += self._period_s
+        return np.asarray(self._control(slopes))
 
 
 def learnt(ready: Commissioned) -> dict[str, Any]:

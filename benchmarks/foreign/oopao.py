@@ -18,6 +18,8 @@ from faintspot.loop.turbulence.slope_covariance import ARCSEC
 
 _R0_M = 0.25  # of the turbulence that is simulated; another r0 scales it
 _POKE_M = 2e-8
+CHANGED_AFTER = 700
+"""Frames before the winds of a `ChangingLoop` change."""
 _TRUNCATED = 4
 """Singular values that OOPAO's reconstructor leaves out."""
 
@@ -212,6 +214,22 @@ class OopaoLoop(SteppedLoop):
         slopes = self._measured(command, path_m)
         phase = self._star.phase[self._pupil] * self._star.wavelength / IMAGING_M
         return slopes, float(abs(np.exp(1j * phase).mean()) ** 2)
+
+
+class ChangingLoop(OopaoLoop):
+    """Loop whose winds become faster by 1.6 and turn by 40 degrees after 700 frames."""
+
+    def paths_m(self, seed: int, frames: int) -> NDArray[np.float32]:
+        """See `SteppedLoop`."""
+        if frames <= CHANGED_AFTER:
+            return super().paths_m(seed, frames)
+        first, winds, atmosphere = super().paths_m(seed, CHANGED_AFTER), self.winds, self._atmosphere
+        self.winds = [(1.6 * speed, direction + 40) for speed, direction in winds]
+        self._atmosphere = f"{atmosphere}-changed"
+        try:
+            return np.concatenate([first, super().paths_m(seed + 100, frames - CHANGED_AFTER)])
+        finally:
+            self.winds, self._atmosphere = winds, atmosphere
 
 
 class _Watched:

@@ -9,7 +9,7 @@ from functools import partial
 from pathlib import Path
 
 from benchmarks.foreign.base import ForeignLoop
-from benchmarks.foreign.oopao import OopaoCase, OopaoLoop
+from benchmarks.foreign.oopao import ChangingLoop, OopaoCase, OopaoLoop
 
 _MODULES = {"oopao": "OOPAO", "specula": "specula", "hcipy": "hcipy", "soapy": "soapy"}
 TOOLS = tuple(_MODULES)
@@ -26,6 +26,8 @@ class Row:
     goal: float | None = None
     turned: bool = False
     """Whether the winds reverse after learning."""
+    changed: bool = False
+    """Whether the winds change after learning, and the control learns again in the background."""
 
     @property
     def tool(self) -> str:
@@ -36,6 +38,10 @@ class Row:
 def _oopao(case: OopaoCase, folder: Path, brightness: float) -> ForeignLoop:
     brighter = replace(case, name=f"{case.name}x{brightness:g}", flux_e=case.flux_e * brightness)
     return OopaoLoop(case if brightness == 1 else brighter, folder)
+
+
+def _changing(folder: Path, brightness: float) -> ForeignLoop:
+    return ChangingLoop(replace(_FIRST, flux_e=_FIRST.flux_e * brightness), folder)
 
 
 def _specula(flux_e: float, own_slopes: bool, folder: Path, brightness: float) -> ForeignLoop:
@@ -82,6 +88,7 @@ ROWS = (
     Row("oopao-dead", "the first, a dead actuator", partial(_oopao, _DEAD), 0.70),
     Row("oopao-columns", "the first, gains of commands 0.5 to 1.5", partial(_oopao, _COLUMNS), 0.70),
     Row("oopao-turned", "the first, winds reversed after learning", partial(_oopao, _FIRST), turned=True),
+    Row("oopao-changed", "the first, other winds after learning", _changing, changed=True),
     Row("specula-40", "27 Zernikes, three winds, 40 e-", partial(_specula, 40.0, False), 0.70),
     Row("specula-20", "27 Zernikes, three winds, 20 e-", partial(_specula, 20.0, False), 0.65),
     Row("specula-own", "40 e-, SPECULA's own slopes", partial(_specula, 40.0, True), 0.725),
