@@ -15,6 +15,7 @@ pytest.importorskip("zarr")
 from tests.engine import telemetry_cases
 from tests.engine.telemetry_cases import FIELDS, LAYOUT, SETTINGS, Engine, N
 from tests.experiments.night.recorded_cases import BEGIN_S, write_recording
+from tests.io import loop_layouts
 from tests.loop.telemetry.alternation_cases import (
     MATRIX,
     PIXEL_ARCSEC,
@@ -67,6 +68,20 @@ def test_engine_without_frames(folder: Path, run: Commands) -> None:
     ring.close()
     assert told.code == 2
     assert f"{name}: no frames in 0.2 s" in told.err
+
+
+def test_a_question_at_a_time(folder: Path, run: Commands) -> None:
+    """Of a table each error names the option that answers it; the last ones are known from its file."""
+    pytest.importorskip("astropy")
+    loop = loop_layouts.random_loop()
+    loop_layouts.sparta(folder, loop._replace(slopes=loop.slopes[:, :12], matrix=loop.matrix[:12]))
+    given = ["telemetry", ".", "--output", "page.html"]
+    run.refused(*given, "--slopes", "Slopes", naming=("--slopes", "Gradients"))
+    run.refused(*given, "--slopes", "gradients", naming=("--slope-unit",))
+    given += ["--slope-unit", "px"]
+    run.refused(*given, naming=("--cells",))
+    given += ["--cells", "none", "--slope-order", "rows"]
+    run.refused(*given, naming=("slope_order", "pairs"))
 
 
 def test_what_does_not_fit_together(folder: Path, run: Commands) -> None:

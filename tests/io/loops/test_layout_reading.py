@@ -51,6 +51,10 @@ def test_sparta_with_the_control_matrix_of_both_mirrors(tmp_path: Path) -> None:
     np.testing.assert_array_equal(values["commands"], LOOP.commands[:, :-2])
     np.testing.assert_array_equal(values["interaction_matrix"], pairs(LOOP.matrix, 0)[:, :-2])
     assert values["remarks"] == ["commands: ITTM_Positions left out, as there is no matrix for it"]
+    np.save(tmp_path / "whole.npy", LOOP.matrix)
+    values = read_layout(path, {"interaction_matrix": "whole.npy"})
+    np.testing.assert_array_equal(values["commands"], LOOP.commands)
+    np.testing.assert_array_equal(values["interaction_matrix"], LOOP.matrix)
     for file in tmp_path.glob("RecnOptimiser*"):
         file.unlink()
     values = read_layout(path, {})
@@ -103,7 +107,7 @@ def test_tables_that_are_not_known(tmp_path: Path) -> None:
     np.testing.assert_array_equal(values["slopes"], LOOP.slopes)
     np.testing.assert_array_equal(values["commands"], LOOP.commands)
     np.testing.assert_array_equal(values["interaction_matrix"], LOOP.matrix)
-    with refused("--slopes", "absent"):
+    with refused("--slopes", "absent", "t.fits", "WFS1_Gradients, Volts"):
         read_layout(path, {"slopes": "absent"})
     number = np.arange(FRAMES) * 1.0
     times = {"FrameCounter": number, "Seconds": number, "USeconds": 0 * number}

@@ -54,10 +54,7 @@ def read_layout(path: Path, named: Mapping[str, str]) -> dict[str, Any]:
     """
     names, chosen = _names(path), named.get("slopes")
     layouts = _fitting(names)
-    if chosen is not None:
-        layouts = [layout for layout in layouts if chosen.upper() == layout.slopes[0].upper()]
-        layouts = layouts or _timed(names, chosen)
-    elif path.is_dir() and not layouts:
+    if path.is_dir() and not layouts and not _find(names, chosen or ""):
         files = [file for file in _files(path) if file.name.lower().endswith(_TABLES)]
         tables = [file for file in files if _fitting(_names(file))]
         if len(tables) == 1:
@@ -65,12 +62,18 @@ def read_layout(path: Path, named: Mapping[str, str]) -> dict[str, Any]:
         if tables:
             listed = _listed(file.name for file in tables)
             raise InputError(f"{path}: expected one table of a loop; name one as FILE: {listed}")
+    if chosen is not None:
+        layouts = [layout for layout in layouts if chosen.upper() == layout.slopes[0].upper()]
+        layouts = layouts or _timed(names, chosen)
     if len(layouts) > 1:
         listed = _listed(layout.slopes[0] for layout in layouts)
         raise InputError(f"{path}: has {len(layouts)} loops; choose one with --slopes: {listed}")
     values: dict[str, Any] = {"origin": "arrays", "sources": {}}
     if layouts:
-        values = _Reader(path, names, layouts[0]).values()
+        layout = layouts[0]
+        if named.keys() & {"commands", "interaction_matrix", "control_matrix"}:  # no matrix but the named one
+            layout = replace(layout, interaction=(), control="", identity=False)
+        values = _Reader(path, names, layout).values()
     elif chosen is None and (path.is_dir() or len(names) > 1):
         raise InputError(
             f"{path}: expected a known layout of telemetry; name an array with --slopes, and one with "
@@ -142,7 +145,9 @@ def _located(path: Path, names: Names, text: str) -> str:
         whole = folder / text
         if whole.exists() or Path(f"{whole}".rpartition(":")[0]).is_file():
             return f"{whole}"
-    return text if path.is_dir() or names else f"{path}:{text}"
+    if names:
+        raise InputError(f"{text}: expected a file, or an array of {path}: {_listed(names)}")
+    return f"{path}:{text}"
 
 
 def _listed(names: Iterable[str]) -> str:
