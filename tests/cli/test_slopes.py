@@ -64,7 +64,7 @@ def test_preset_goes_before_the_configuration(folder: Path, run: Commands) -> No
     assert 'preset = "fast"' in Path("faintspot.toml").read_text()
     run.ok("slopes", "a.npy", "-o", "s.npz")
     assert_equal(folder / "s.npz", SlopePipeline(LAYOUT, SETTINGS.replace(preset="fast"))(frames))
-    run.ok("slopes", "a.npy", "-o", "t.npz", "--preset", "accurate")
+    run.ok("slopes", "a.npy", "-o", "t.npz", "--set", "preset=accurate")
     assert_equal(folder / "t.npz", expected(frames))
 
 

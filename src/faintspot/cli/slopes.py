@@ -8,7 +8,7 @@ from typing import Any
 
 import click
 
-from faintspot.base.config.tables import PRESETS, parse_changes
+from faintspot.base.config.tables import parse_changes
 from faintspot.base.errors import InputError, MissingExtraError
 from faintspot.base.flags import SubapertureFlag
 from faintspot.cli.shared.commands import KEY, NAMES, REFERENCE, configuration_option, option
@@ -35,12 +35,6 @@ from faintspot.slopes.recorded import Summary, measure_recorded
     "--set", "changes", metavar="NAME=VALUE", multiple=True, help="An option of the estimator; several times."
 )
 @option("--no-denoise", is_flag=True, help="Switch the denoising off: the other method of a comparison.")
-@option(
-    "--preset",
-    type=click.Choice(PRESETS),
-    help="How much work to do.",
-    show_default="as the configuration says",
-)
 @option(
     "--unit",
     type=click.Choice(UNITS),
@@ -110,7 +104,7 @@ def command(
     Examples:
       faintspot slopes night1.fits night2.fits.gz -c faintspot.toml -o slopes.zarr
       faintspot slopes night1.fits -o plain.zarr --no-denoise
-      faintspot slopes night1.fits -o slopes.zarr --preset fast
+      faintspot slopes night1.fits -o slopes.zarr --set preset=fast
       faintspot slopes night1.fits -o ml.zarr --estimator ml --set model_error=0.1
       faintspot slopes night1.fits -o window.zarr --estimator window --mean-flux
       faintspot slopes aberrated.fits -o followed.zarr --follow

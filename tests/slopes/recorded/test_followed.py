@@ -52,7 +52,7 @@ def test_the_command_follows(record: Recording, capsys: pytest.CaptureFixture[st
     np.testing.assert_allclose(
         wavefront.coefficients, fs.fit_wavefront(truth, record.layout, modes=6).coefficients, atol=0.05
     )
-    run.ok("wavefront", "s.zarr", "-o", "w.csv")
+    run.ok("wavefront", "s.zarr", "-o", "w.json")
 
 
 def test_resumed_it_is_the_same(record: Recording) -> None:

@@ -32,9 +32,6 @@ from faintspot.cli.shared.needs import needs
 )
 @option("--rounds", type=click.IntRange(4), default=100, help="Most rounds.")
 @option("--settle-frames", type=click.IntRange(1), default=3, help="Frames until a command acts.")
-@option(
-    "--frames-per-poke", "frames", type=click.IntRange(2), default=2, help="Frames averaged for each poke."
-)
 @option("--keep-reference", is_flag=True, help="Leave the reference slopes as they are.")
 def calibrate(
     config: str,

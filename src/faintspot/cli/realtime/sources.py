@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from faintspot.base.errors import InputError
-from faintspot.cli.shared.commands import FRAMES, KEY, SLOTS, name_option, option
+from faintspot.cli.shared.commands import FRAMES, KEY, name_option, option
 from faintspot.cli.shared.engine_requests import published, stop_on_signal
 from faintspot.cli.shared.needs import needs
 from faintspot.cli.shared.progress import progress_bar
@@ -42,14 +42,12 @@ _DEFAULT_RATE_HZ = 500.0
     "--frames", "n_frames", type=int, metavar="N", help="Number of frames from there on.", show_default="all"
 )
 @KEY
-@SLOTS
 def replay(
     frames: tuple[str, ...],
     name: str,
     frame_rate_hz: float | None,
     key: str | None,
     time_axis: int | None,
-    slots: int,
     **options: Any,
 ) -> None:
     """Publish recorded frames in the pixel ring NAME, for `faintspot realtime run`.
@@ -81,7 +79,7 @@ def replay(
         stop_on_signal() as stop,
         quick_switching(),
         open_frames(frames, key=key, time_axis=time_axis) as source,
-        PixelRing.create(name, source.shape, ring_type(source.dtype), slots=slots) as ring,
+        PixelRing.create(name, source.shape, ring_type(source.dtype)) as ring,
         Replay(source, ring, frame_rate_hz=rate_hz, waits=waits, **options) as player,
     ):
         rows, columns = source.shape
@@ -108,14 +106,12 @@ def replay(
 @option("--commands-to", "commands", metavar="STREAM", help="Publish the commands as isio:NAME.")
 @name_option("Name of the pixel ring and of the engine's streams.")
 @FRAMES
-@SLOTS
 def bridge(
     stream: str | None,
     slopes: str | None,
     commands: str | None,
     name: str,
     frames: int | None,
-    slots: int,
 ) -> None:
     """Connect `faintspot realtime run` with other software's streams in shared memory.
 
@@ -152,7 +148,7 @@ def bridge(
     spins = False if outs else None  # the outputs need processors, too
     with stop_on_signal() as stop, quick_switching() if outs else nullcontext(), _running(outs, stop):
         if stream:
-            counters = StreamBridge(stream, name, say=say, slots=slots, spins=spins).run(frames, stop)
+            counters = StreamBridge(stream, name, say=say, spins=spins).run(frames, stop)
         else:
             stop.wait()
     if stream:

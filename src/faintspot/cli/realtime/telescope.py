@@ -10,7 +10,7 @@ from typing import Any, Self
 import click
 
 from faintspot.base.files import output_errors
-from faintspot.cli.shared.commands import FRAMES, READOUT_FRACTION, SLOTS, name_option, option
+from faintspot.cli.shared.commands import FRAMES, READOUT_FRACTION, name_option, option
 from faintspot.cli.shared.engine_requests import published, stop_on_signal
 from faintspot.engine.requests.requests import TELESCOPE, socket_path
 
@@ -42,7 +42,6 @@ from faintspot.engine.requests.requests import TELESCOPE, socket_path
     help="Rows published together.",
     show_default="a sub-aperture's",
 )
-@SLOTS
 @FRAMES
 @option(
     "--seed", type=click.IntRange(0), help="Seed of turbulence and noise.", show_default="the configuration's"

@@ -209,7 +209,6 @@ KEY = which_frames()
 FRAMES = option(
     "--frames", type=click.IntRange(1), help="Stop after this number of frames.", show_default="at Ctrl-C"
 )
-SLOTS = option("--slots", type=int, default=4, help="Frames in the ring.")
 READOUT_FRACTION = option(
     "--readout-fraction",
     type=float,

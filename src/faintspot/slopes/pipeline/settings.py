@@ -305,23 +305,6 @@ def without_denoising(settings: Settings, where: str) -> Settings:
     return settings.replace(estimator=plain)
 
 
-def with_preset(settings: Settings, preset: str) -> Settings:
-    """Return settings whose estimator uses the given preset.
-
-    Raises
-    ------
-    InputError
-        If the estimator has no presets.
-    """
-    if "preset" not in settings.estimator.declared():
-        others = ", ".join(repr(name) for name, kind in estimators().items() if "preset" in kind.declared())
-        raise InputError(
-            f"preset = {preset!r}: the estimator {settings.estimator.name!r} has no presets; "
-            f"expected one of {others}"
-        )
-    return settings.replace(preset=preset)
-
-
 def option_names() -> list[str]:
     """Return the names of all options of all estimators, and the shared ones, preceded by "estimator"."""
     specific = (name for kind in estimators().values() for name in kind.declared())
@@ -337,4 +320,4 @@ def spot_fwhm_px(settings: Settings, n_subapertures: int, pixels: int) -> NDArra
     return np.column_stack([along, np.where(np.isnan(across), along, across)])
 
 
-__all__ = ["Settings", "check_option", "option_names", "spot_fwhm_px", "with_preset", "without_denoising"]
+__all__ = ["Settings", "check_option", "option_names", "spot_fwhm_px", "without_denoising"]

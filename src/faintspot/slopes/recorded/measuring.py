@@ -27,7 +27,7 @@ from faintspot.slopes.camera.frame_checks import are_repeated
 from faintspot.slopes.pipeline import configuration
 from faintspot.slopes.pipeline.configuration import Configuration
 from faintspot.slopes.pipeline.light import MeanFlux
-from faintspot.slopes.pipeline.settings import Settings, spot_fwhm_px, with_preset, without_denoising
+from faintspot.slopes.pipeline.settings import Settings, spot_fwhm_px, without_denoising
 from faintspot.slopes.pipeline.slope_pipeline import SlopePipeline
 from faintspot.slopes.pipeline.slopes import Slopes, layout_coordinates
 from faintspot.slopes.recorded.survey import Survey, configured, frames_apart, response, stretches, survey
@@ -111,8 +111,6 @@ class Choices(Reading, total=False):
 
     denoise: bool
     """False switches the denoising off for all sub-apertures."""
-    preset: str | None
-    """"accurate" or "fast", instead of that in the configuration."""
     changes: Mapping[str, Any] | None
     """New values of settings by name, instead of those in the configuration; "estimator" is one."""
     unit: str
@@ -251,8 +249,7 @@ def _settings(settings: Settings, choices: Choices) -> Settings:
         settings = settings.replace(**changes)
     if not choices.get("denoise", True):
         settings = without_denoising(settings, "denoise = False (--no-denoise)")
-    preset = choices.get("preset")
-    return settings if preset is None else with_preset(settings, preset)
+    return settings
 
 
 def _calibration(
