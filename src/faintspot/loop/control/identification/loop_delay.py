@@ -24,7 +24,7 @@ Floats = NDArray[np.float64]
 _WINDOW, _WINDOW_S = 128, 0.52  # frames; a longer window if the frame rate is so high that these last longer
 _FEWEST_PIECES, _FEWEST_LONG_PIECES = 4, 12
 MOST_DELAY, _USUAL_DELAY = 5, 3
-_UNLIKE = 3.0  # misfit above which longer delays than the usual ones explain only what is not turbulence
+_CLEARLY = 9.0  # logarithm of the likelihood ratio, for a longer delay than the usual ones to be preferred
 _STEP = 0.1  # of fractional delays
 GAINS = 0.1, 1.6
 """Limits of the search for the centroid gain."""
@@ -176,14 +176,20 @@ class DelayFits:
             for delay in range(1, MOST_DELAY + 1)
             for fit in self._fits
         }
-        for most in MOST_DELAY, _USUAL_DELAY:
+        for most in _USUAL_DELAY, MOST_DELAY:
             fit, whole = min((key for key in tried if key[1] <= most), key=tried.__getitem__)
             fit.begin()
             fit.of(whole)
             misfit = fit.misfit(whole)
-            if misfit < _UNLIKE:
+            likely = {
+                delay
+                for (_, delay), unlikely in tried.items()
+                if unlikely < tried[fit, whole] + _CLEARLY * misfit**2
+            }
+            if min(tried.values()) > tried[fit, whole] - _CLEARLY * misfit**2:
                 break
-        delays = np.arange(max(whole - 1.0, 1.0), min(whole + 1.0, MOST_DELAY) + 0.5 * _STEP, _STEP)
+        first, last = min(likely) - 1.0, max(likely) + 1.0
+        delays = np.arange(max(first, 1.0), min(last, most) + 0.5 * _STEP, _STEP)
         values = np.array([fit.of(delay, _FEW_UPDATES) for delay in delays])
         weight = np.exp((values[:, 1].min() - values[:, 1]) / misfit**2)
         weight /= weight.sum()
