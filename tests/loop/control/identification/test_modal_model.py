@@ -12,7 +12,7 @@ from faintspot.loop.control.base import CommandDelayLine
 from faintspot.loop.control.identification.predictive_control import PredictiveControl, learn
 
 GAIN, LOOP_GAIN, DELAY = 0.8, 0.4, 2
-FRAMES = 4000
+FRAMES = 2500
 
 
 def driven(control: Any, open_loop: Floats, matrix: Floats, seed: int) -> float:

@@ -85,6 +85,7 @@ class LoopInModes:
 
     described: LoopOfControl
     seen: OpenLoop
+    rate_hz: float
 
     @classmethod
     def of(cls, ready: Prepared, delay: LoopDelay) -> Self:
@@ -109,4 +110,4 @@ class LoopInModes:
             analysis=modes.analysis,
             recorded=loop.part(slice(0, 1)).scaled(1 / loop.unit),
         )
-        return cls(described, open_loop_of(modes.recording, replace(delay, gain=1.0)))
+        return cls(described, open_loop_of(modes.recording, replace(delay, gain=1.0)), loop.frame_rate_hz)

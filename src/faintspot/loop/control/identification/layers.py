@@ -7,6 +7,7 @@ import math
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -88,6 +89,7 @@ class _Fit:
         self._length, self._segments = modes.length, modes.segments
         self._frequency, self._bins = bins / modes.length, bins
         self._correlation = np.correlate(modes.window, modes.window, "full")[modes.length - 1 :]
+        self._of_line = lru_cache(4 * _MOST)(self._line)  # a step of the fit changes one oscillator at a time
 
     def best(self) -> Floats:
         """Return the parameters that the information criterion selects."""
@@ -124,10 +126,14 @@ class _Fit:
     def _expected(self, x: Floats) -> Floats:
         total = np.full(len(self._spectrum), math.exp(np.clip(x[0], -80, 80)))
         for frequency, damping, power in x[1:].reshape(-1, 3):
-            lagged = self._correlation * _vibration(frequency, damping).correlation(1.0, self._length)
-            spectrum = 2 * np.fft.rfft(lagged).real[self._bins] - lagged[0]
-            total += math.exp(np.clip(power, -80, 80)) * np.maximum(spectrum, 0.0)
+            total += math.exp(np.clip(power, -80, 80)) * self._of_line(float(frequency), float(damping))
         return total
+
+    def _line(self, frequency: float, damping: float) -> Floats:
+        """Return the spectrum of an oscillator of variance 1."""
+        lagged = self._correlation * _vibration(frequency, damping).correlation(1.0, self._length)
+        spectrum: Floats = np.maximum(2 * np.fft.rfft(lagged).real[self._bins] - lagged[0], 0.0)
+        return spectrum
 
 
 _SPEEDS_M_PER_S = (5.0, 10.0, 20.0)  # of winds from anywhere

@@ -146,7 +146,7 @@ def _corrected(
 
 def _in_modes(ready: Prepared, modes: LoopInModes) -> tuple[LoopOfControl, Kalman]:
     """Learn from modes alone."""
-    learnt = learn_modes(modes.described.plant(), modes.seen.telemetry)
+    learnt = learn_modes(modes.described.plant(), modes.seen.telemetry, modes.rate_hz)
     return _controlling(modes.described, ready, modes.seen, learnt)
 
 
@@ -156,6 +156,8 @@ def _controlling(
     """Return the control of a learnt filter, with its fallback and stroke limit."""
     loop, plant, gain = ready.recording, described.plant(), float(described.delay[2])
     advised = _advised_gain(learnt.plain_gain, gain, float(described.delay[3]), plant.delay_frames)
+    if described.analysis.size:  # whose centroid gain is less certain: a loop that has run is stable
+        advised = min(advised, ready.loop_gain)
     recorded, remarks = ready.loop_gain, list(loop.remarks)
     plain = recorded if math.isfinite(recorded) else advised
     if abs(math.log(max(plain, 1e-9) / advised)) > math.log(_MOST_OFF):

@@ -4,15 +4,17 @@ With the right delay and gain, the open-loop spectrum of every mode is white noi
 with frequency. With wrong ones it has bumps that no such sum has. So delay and gain are those for which the
 spectra are closest to such sums in the sense of Itakura & Saito, the contrast of Whittle's likelihood: it
 does not depend on scale, so all delays and gains are compared by the shapes of their spectra alone.
+Vibrations count little, and their wings are a part of the sum.
 """
 
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import binary_dilation, median_filter
+from scipy.ndimage import median_filter
 
 from faintspot.loop.control.identification.loop_delay import (
     GAINS,
@@ -31,9 +33,12 @@ _MOST_MODES = 8
 _KNEES, _POWER = (1e-3, 3e-3, 1e-2, 3e-2), 2.5
 """Turbulence is a sum of (1 + (f / knee)^2)^-power, the knees in parts of the frame rate: between the powers
 of Zernike tilt, 11 / 6, and of the mean gradient, 17 / 6, of the pupil."""
-_STEP, _GAIN_STEPS, _UPDATES = 0.1, 36, 60
+_STEP, _GAIN_STEPS, _UPDATES = 0.1, 36, 30
+_MOST_CONTRAST = 6.0  # of a frequency with more power than the model: vibrations count no more than that
+_CONTRADICTS = 10.0  # by how much more unlikely a delay is one that the recording contradicts
 _EXPECTED_GAIN = 0.4  # standard deviation of the gain's logarithm about 0, before anything is measured
 _MOST_PEAKS, _DAMPING = 4, 0.01  # bins of lines of a mode with wings, and these
+_FEW_MODES = 4  # with which lines of the loop look like vibrations
 _LINE, _BACKGROUND = 4.0, 9  # height of a line in standard deviations, and bins of the median around it
 _DELAY_ERROR, _GAIN_ERROR = 0.06, 0.15  # frames, and relative: spectra differ from such sums
 _FREQUENCIES = 2**14
@@ -74,21 +79,26 @@ class ModalFits:
         self._products = np.array(products)
         """(modes, frequencies, 1 + lags, 1 + lags)"""
         self._independent = INDEPENDENT * pieces
-        lines = _lines(self._products[..., 0, 0], self._independent)
-        self._counts, self._shapes = ~lines, _shapes(window, self._products[..., 0, 0] * lines)
+        power = self._products[..., 0, 0]
+        self._shapes = _shapes(window, power * _lines(power, self._independent))
         self._gains = np.geomspace(GAINS[0], GAINS[1], _GAIN_STEPS)[1:-1]
         self._strength: Floats | None = None
+        self._delays = np.arange(1.0, MOST_DELAY + 0.5 * _STEP, _STEP)
+        self._all = np.array([self._misfit(delay) for delay in self._delays])
+        """(delays, gains): minus the logarithm of the likelihood."""
 
     def of(self, delay_frames: float) -> LoopDelay:
-        """Return the gain for a delay that is known."""
-        return self._likely(np.array([delay_frames]))
+        """Return the gain for a delay that is known; that of the best one if it does not fit at all."""
+        known, misfit = np.array([delay_frames]), self._misfit(delay_frames)[None]
+        if misfit.min() > self._all.min() + _CONTRADICTS:
+            return replace(self.best(), delay_frames=delay_frames, delay_error=0.0)
+        return self._likely(known, misfit)
 
     def best(self) -> LoopDelay:
         """Return delay and gain, averaged over those that are likely."""
-        return self._likely(np.arange(1.0, MOST_DELAY + 0.5 * _STEP, _STEP))
+        return self._likely(self._delays, self._all)
 
-    def _likely(self, delays: Floats) -> LoopDelay:
-        misfit = np.array([self._misfit(delay) for delay in delays])
+    def _likely(self, delays: Floats, misfit: Floats) -> LoopDelay:
         weight = np.exp(misfit.min() - misfit)
         weight /= weight.sum()
         later = float(weight.sum(axis=1) @ (delays - delays[0]))
@@ -110,17 +120,24 @@ class ModalFits:
         if strength is None:
             strength = np.einsum("gmf,ms->gms", power, 1 / shapes.sum(axis=2)) / shapes.shape[1]
         for _ in range(_UPDATES):
-            inverse = self._counts / np.einsum("gms,msf->gmf", strength, shapes, optimize=True)
+            model = np.einsum("gms,msf->gmf", strength, shapes, optimize=True)
+            weight = np.exp(-self._contrast(power / model) / _MOST_CONTRAST) / model
             explained, expected = (
                 np.einsum("gmf,msf->gms", values, shapes, optimize=True)
-                for values in (power * inverse**2, inverse)
+                for values in (weight * power / model, weight)
             )
             strength = strength * np.maximum(explained / np.maximum(expected, 1e-300), 1e-9)
         self._strength = np.maximum(strength, 1e-9 * np.max(strength, axis=-1, keepdims=True))
         ratio = power / np.einsum("gms,msf->gmf", strength, shapes)
-        contrast = (self._counts * (ratio - np.log(ratio) - 1)).sum(axis=(1, 2))
-        misfit: Floats = self._independent * contrast + 0.5 * (np.log(self._gains) / _EXPECTED_GAIN) ** 2
-        return misfit
+        above = _MOST_CONTRAST * (1 - np.exp(-self._contrast(ratio) / _MOST_CONTRAST))
+        below = self._independent * np.where(ratio < 1, ratio - np.log(ratio) - 1, 0.0)
+        misfit: Floats = (above + below).sum(axis=(1, 2))
+        return misfit + 0.5 * (np.log(self._gains) / _EXPECTED_GAIN) ** 2
+
+    def _contrast(self, ratio: Floats) -> Floats:
+        """Return the contrast of powers above the model, 0 below it."""
+        contrast: Floats = self._independent * np.where(ratio > 1, ratio - np.log(ratio) - 1, 0.0)
+        return contrast
 
 
 def _shapes(window: Floats, lines: Floats) -> Floats:
@@ -149,14 +166,14 @@ def _shapes(window: Floats, lines: Floats) -> Floats:
 
 
 def _lines(power: Floats, independent: float) -> NDArray[np.bool_]:
-    """Return where narrow lines are in spectra, (modes, frequencies): vibrations, which do not count."""
+    """Return where spectra have lines of vibrations, (modes, frequencies): not in most modes."""
     background = median_filter(power, (1, _BACKGROUND), mode="nearest")
     high = power > (1 + _LINE / math.sqrt(independent)) * background
-    return np.asarray(binary_dilation(high, np.ones((1, 3))))
+    return np.asarray(high if len(power) < _FEW_MODES else high & (high.mean(axis=0) <= 0.5))
 
 
 def law_of(modes: Floats, sent: Floats, run: NDArray[np.int64]) -> str:
-    """Return the name of the law that made the commands, with its gain, by regression of each mode.
+    """Return the name of the law that made the commands, with an integrator's gain, by regression of modes.
 
     Parameters as for `ModalFits`.
     """
@@ -175,5 +192,5 @@ def law_of(modes: Floats, sent: Floats, run: NDArray[np.int64]) -> str:
             gains.append(-float(weights[:before].sum()))
             kept.append(float(weights[before:].sum()))
         if left <= _EXACT**2 * total and min(kept) > _LEAST_KEPT:
-            return f"{name} of gain {np.median(np.abs(gains)):.2g}"
+            return f"{name} of gain {np.median(np.abs(gains)):.2g}" if name == INTEGRATOR else name
     return OTHER

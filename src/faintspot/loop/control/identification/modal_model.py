@@ -3,21 +3,25 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from faintspot.loop.control.base import OpenLoopTelemetry
 from faintspot.loop.control.identification.controlled_loop import LoopInModes
+from faintspot.loop.control.identification.layers import Identification
 from faintspot.loop.control.identification.learning import GAINS, JUDGED_PART, replayed_part
 from faintspot.loop.control.identification.modal_loop import length_of_piece, spectra_of_modes
 from faintspot.loop.control.identification.model import Kalman
-from faintspot.loop.control.identification.open_loop import OpenLoop
+from faintspot.loop.control.identification.open_loop import OpenLoop, site_of_loop
+from faintspot.loop.control.identification.recording import Recording
 from faintspot.loop.control.integrator import LoopPlant
 from faintspot.loop.control.kalman.modal_predictor import modal_filter, prediction_errors
 
 Floats = NDArray[np.float64]
+Kind = Callable[[Kalman, LoopPlant, OpenLoopTelemetry, float], Kalman]
 
 _ORDERS = (4, 8, 12, 20, 30, 50, 80, 120, 200)
 _FRAMES_FOR_ORDER = 80  # frames of a recording for each coefficient
@@ -26,9 +30,11 @@ _BLOCKS, _MOST_COMPARED = 4, 100  # of frames left out, and modes, by which orde
 
 
 def learn_modes(
-    plant: LoopPlant, telemetry: OpenLoopTelemetry, of_commands: ArrayLike | None = None
+    plant: LoopPlant, telemetry: OpenLoopTelemetry, rate_hz: float, of_commands: Floats | None = None
 ) -> Kalman:
-    """Return a filter of independent modes, the order of whose autoregression is chosen on held-out frames.
+    """Return a filter of independent modes: autoregressions or, of two modes, oscillators.
+
+    Of both, what leaves less of the last third, learnt on the rest, is learnt from all frames.
 
     Parameters
     ----------
@@ -36,25 +42,44 @@ def learn_modes(
         With the interaction matrix in modes.
     telemetry : OpenLoopTelemetry
         Open-loop modes.
+    rate_hz : float
+        Frames per second.
     of_commands : (commands, commands) array, optional
         From commands to compared amplitudes, see `Kalman`. Default: to the modes that they cause.
     """
     if of_commands is None:
         values, vectors = np.linalg.eigh(plant.interaction.T @ plant.interaction)
         of_commands = (vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T
-    of_commands = np.asarray(of_commands, np.float64)
-    part = replayed_part(telemetry, len(plant.interaction))
-    gain, plain_residual = plant.best_gain(GAINS, part, of_commands @ plant.reconstructor.matrix)
+    phase = of_commands @ plant.reconstructor.matrix
+    gain, residual = plant.best_gain(GAINS, replayed_part(telemetry, len(plant.interaction)), phase)
+    model = Kalman({}, gain, 1.0, (math.inf, residual), of_commands)
+
+    def learnt(kind: Kind, learning: OpenLoopTelemetry, scored: OpenLoopTelemetry) -> Kalman:
+        return kind(model, plant, learning, rate_hz).scored(plant, scored)
+
+    kinds: list[Kind] = [_autoregressions]
+    if len(plant.interaction) == 2:
+        kinds.append(_oscillators)
+    first = len(telemetry) - round(JUDGED_PART * len(telemetry))
+    if len(kinds) > 1:
+        parts = telemetry.part(0, first), telemetry.part(first, None)
+        kinds.sort(key=lambda kind: learnt(kind, *parts).left[0])
+    return learnt(kinds[0], telemetry, replayed_part(telemetry, len(plant.interaction)))
+
+
+def _autoregressions(model: Kalman, plant: LoopPlant, telemetry: OpenLoopTelemetry, rate_hz: float) -> Kalman:
     modes = np.where(telemetry.trust > 0, telemetry.open_loop_px, np.nan)
     orders = best_orders(modes, plant.delay_frames)
     text = f"{orders.min()}" if orders.min() == orders.max() else f"{orders.min()} to {orders.max()}"
-    model = replace(
-        Kalman(
-            modal_filter(*spectra_of_modes(modes), orders), gain, 1.0, (math.inf, plain_residual), of_commands
-        ),
-        description=f"{len(plant.interaction)} modes, each an autoregression of order {text}",
-    )
-    return model.scored(plant, part)
+    description = f"{len(orders)} modes, each an autoregression of order {text}"
+    return replace(model, arrays=modal_filter(*spectra_of_modes(modes), orders), description=description)
+
+
+def _oscillators(model: Kalman, plant: LoopPlant, telemetry: OpenLoopTelemetry, rate_hz: float) -> Kalman:
+    """Return the filter of two modes as of tip and tilt of a single sub-aperture."""
+    single = Recording(np.zeros((1, 2)), None, None, np.zeros((1, 2)), rate_hz)
+    fit = Identification(telemetry, site_of_loop(single), rate_hz).layers()
+    return model.learnt(plant, telemetry, [fit])
 
 
 def best_orders(modes: Floats, frames: int) -> NDArray[np.int64]:
@@ -96,8 +121,8 @@ def share_of_modes(modes: LoopInModes, winds: Kalman, plant: LoopPlant, seen: Op
     seen : OpenLoop
         What it has learnt from.
     """
-    own, telemetry = modes.described.plant(), modes.seen.telemetry
+    own, telemetry, rate_hz = modes.described.plant(), modes.seen.telemetry, modes.rate_hz
     first = len(telemetry) - round(JUDGED_PART * len(telemetry))
-    learnt = learn_modes(own, telemetry.part(0, first), winds.phase_of_commands)
+    learnt = learn_modes(own, telemetry.part(0, first), rate_hz, winds.phase_of_commands)
     left = learnt.scored(own, telemetry.part(first, None)).left[0]
     return left / winds.scored(plant, seen.telemetry.part(first, None)).left[0]
