@@ -42,7 +42,7 @@ def parse(words: list[str]) -> None:
     """Find the command and parse its options, without doing anything."""
     command: click.Command = group
     context = click.Context(command, info_name="faintspot", **command.context_settings)
-    while isinstance(command, click.Group) and words:
+    while isinstance(command, click.Group) and words and not words[0].startswith("-"):
         found = command.get_command(context, words[0])
         assert found is not None, words[0]
         command, words = found, words[1:]
