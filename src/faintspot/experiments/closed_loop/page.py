@@ -12,7 +12,6 @@ from faintspot.base.report.texts import Texts
 from faintspot.base.statistics import paired_mean
 from faintspot.experiments.closed_loop.results import MagnitudeResult, differences_by_flux
 from faintspot.experiments.closed_loop.verdict import (
-    gain_table,
     loop_verdict,
     reference_methods,
     settings_table,
@@ -58,14 +57,10 @@ def loop_warnings(result: MagnitudeResult) -> list[str]:
 def _of_magnitudes(result: MagnitudeResult, strehl: str) -> list[Section]:
     """Return the sections of Strehl against magnitude; `strehl` is the label of an axis."""
     references = reference_methods(result)
-    gains = [
-        gain_table(result, [n for n in range(len(result.labels)) if n not in references[: rank + 1]], method)
-        for rank, method in enumerate(references)
-    ]
-    tables, figure = [strehl_table(result), *gains], magnitude_figure(result, references[0], strehl)
+    figure = magnitude_figure(result, references[0], strehl)
     base = " and then with ".join(result.labels[method] for method in references)
     return [
-        _TEXT.section("magnitude", *tables, figure, shape=result.strehl.shape, reference=base),
+        _TEXT.section("magnitude", strehl_table(result), figure, shape=result.strehl.shape, reference=base),
         _TEXT.section("settings", settings_table(result)),
     ]
 

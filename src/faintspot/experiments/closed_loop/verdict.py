@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import textwrap
 import tomllib
-from collections.abc import Sequence
 
 import numpy as np
 
@@ -27,16 +26,6 @@ from faintspot.slopes.estimators.built_in.total_variation import TotalVariation
 from faintspot.slopes.estimators.built_in.window import Window
 
 _TEXT = Texts("faintspot.experiments")
-
-
-def gain_table(result: MagnitudeResult, methods: Sequence[int], reference: int) -> Table:
-    """Return the gains in limiting magnitude of methods over a reference at equal Strehl."""
-    gains = {result.labels[method]: gains_in_magnitude(result, method, reference) for method in methods}
-    rows = [
-        [name, *(with_interval(gain, 2) for gain in of_method.values())] for name, of_method in gains.items()
-    ]
-    columns = [f"at Strehl {level:g}" for level in next(iter(gains.values()), {})]
-    return _TEXT.table("tables.gain", rows, columns, reference=result.labels[reference])
 
 
 def strehl_table(result: MagnitudeResult) -> Table:
