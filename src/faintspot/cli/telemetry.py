@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tempfile
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -178,7 +179,8 @@ def command(
 
         click.echo("controller ...", err=True)
         with errors_within(f"{controller}: not written, keep the integrator"):
-            control = learn(loop) if report.observed is None else PredictiveControl.of(report.observed)
+            bare = replace(loop, remarks=())
+            control = learn(bare) if report.observed is None else PredictiveControl.of(report.observed)
         control.save(controller)
         click.echo(f"{controller}: {control.summary()}")
 

@@ -131,9 +131,10 @@ def report_of_loop(
     InputError
         When the slopes do not vary, or commands and slopes are not of one loop.
     """
-    ready = prepared(loop)
+    ready = prepared(replace(loop, remarks=()))  # a controller that is learnt describes itself, not the files
     parts = {name: Part(_TEXT[f"{name}.title"]) for name in _PARTS}
-    report = LoopReport(ready.recording, parts)
+    remarks = (*loop.remarks, *ready.recording.remarks)
+    report = LoopReport(replace(ready.recording, remarks=remarks), parts)
     _frames(report)
     progress("delay")
     delay = _loop(report)
