@@ -67,11 +67,12 @@ class LoopDelay:
     """Rms deviation of spectra from the fitted ones, in units of that of chance; 1 or more."""
 
     def for_control(self) -> LoopDelay:
-        """Return the same with a gain that a controller may assume: larger where the spectra do not fit.
+        """Return the same with a gain that a controller may assume: larger by half its error.
 
         A gain assumed too small makes the loop unstable; one too large by as much only makes it slower.
+        Where the spectra do not fit, it is larger by up to its error.
         """
-        return replace(self, gain=min(self.gain + self.gain_error * (1 - 1 / self.misfit), max(GAINS)))
+        return replace(self, gain=min(self.gain + self.gain_error * (1 - 0.5 / self.misfit), max(GAINS)))
 
     @property
     def gain_summary(self) -> str:
