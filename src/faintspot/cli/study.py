@@ -12,15 +12,18 @@ from faintspot.base.extras import require
 from faintspot.base.files import derived, write_atomically
 from faintspot.cli.shared.commands import option
 from faintspot.cli.shared.needs import needs
-from faintspot.cli.shared.progress import QUICK, experiment_options, progress_bar, simulate_night
+from faintspot.cli.shared.progress import QUICK, experiment_options, progress_bar, simulate_night, worker_pool
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     import xarray
 
     from faintspot.experiments.night.blocks import Night
     from faintspot.experiments.study.specification import StudySpecification
 
 _PAPER, _ESTIMATORS = "paper", "estimators"
+_LOOP = "loop"  # a figure that the paper has not, and takes longer than all others
 
 
 @needs("loop", "joblib", "xarray", "zarr")
@@ -32,7 +35,8 @@ _PAPER, _ESTIMATORS = "paper", "estimators"
     "figures",
     multiple=True,
     metavar="NAME",
-    help="Only what this figure of the paper needs: fig2 to fig7, or night (Table 1 and its figure).",
+    help="Only what this figure of the paper needs: fig2 to fig7, or night (Table 1 and its figure). loop: "
+    "where denoising pays in a closed loop.",
 )
 @option(
     "--output",
@@ -105,7 +109,7 @@ def _repeat_the_paper(target: str, quick: bool, figures: tuple[str, ...], where:
     from faintspot.experiments.study.specification import FIGURES, NIGHT, paper_study
     from faintspot.loop.simulation.configuration.configuration import load_loop
 
-    of_study = tuple(name for name in figures or FIGURES if name != NIGHT)
+    of_study = tuple(name for name in figures or FIGURES if name not in (NIGHT, _LOOP))
     described = paper_study(quick, of_study) if of_study else None
     dataset = None if described is None else _measure(described, target, **where)
     night = None
@@ -113,11 +117,28 @@ def _repeat_the_paper(target: str, quick: bool, figures: tuple[str, ...], where:
         folder = night_folder(target)
         night = simulate_night(load_loop("canary"), folder, quick=quick, **where)
         click.echo(f"{folder / PAGE_FILE}: open it in a browser")
+    if _LOOP in figures:
+        _map_the_loop(derived(target, "-map"), quick, **where)
     if dataset is not None:
         _write_page(dataset, target, night)
+    if dataset is None and night is None:
+        return
     table = derived(target, ".md")
     write_atomically(table, paper_markdown(paper_rows(dataset, night)))
     click.echo(f"{table}: the paper, figure by figure")
+
+
+def _map_the_loop(
+    folder: Path, quick: bool, overwrite: bool, workers: int | None, scheduler: str | None
+) -> None:
+    """Compare methods in closed loops, and write their page."""
+    from faintspot.experiments.paper.loop_map import loop_map_page, run_loop_map
+
+    with worker_pool("loop", workers, scheduler) as pool:
+        cells = run_loop_map(folder, quick=quick, pool=pool, overwrite=overwrite)
+    page = folder / "report.html"
+    loop_map_page(cells).write(page)
+    click.echo(f"{page}: open it in a browser")
 
 
 def _write_page(dataset: xarray.Dataset, target: str, night: Night | None = None) -> None:

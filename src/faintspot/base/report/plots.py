@@ -305,6 +305,8 @@ class Picture:
         Options of Matplotlib's `imshow`.
     marks : sequence of Mark
     x_range, y_range : pair of float, optional
+    x_names, y_names : sequence of str
+        Names of columns and rows, in place of numbers.
     background : str
         Colour where the image has no value.
     share : float
@@ -320,6 +322,8 @@ class Picture:
     marks: Sequence[Mark] = ()
     x_range: tuple[float, float] | None = None
     y_range: tuple[float, float] | None = None
+    x_names: Sequence[str] = ()
+    y_names: Sequence[str] = ()
     background: str = FLUX_GREY
     share: float = 1.0
 
@@ -330,6 +334,9 @@ class Picture:
             mark.draw(axes)
         axes.set(xlabel=self.x, ylabel=self.y, title=self.title, facecolor=self.background)
         axes.set(xlim=self.x_range or image.get_extent()[:2], ylim=self.y_range or image.get_extent()[2:])
+        for axis, names in ((axes.xaxis, self.x_names), (axes.yaxis, self.y_names)):
+            if names:
+                axis.set_ticks(range(len(names)), names)
         if self.unit:
             colour_bar(axes, image, self.unit)
 
