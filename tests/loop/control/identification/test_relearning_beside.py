@@ -79,6 +79,8 @@ def test_the_result_of_another_process() -> None:
     work = BesideTheLoop(code, write, lambda folder: (folder / "out").read_text())
     assert work.result() == "abab"
     assert not work.is_running
+    failing = BesideTheLoop("raise SystemExit(1)", write, lambda folder: (folder / "out").read_text())
+    assert failing.result() is None
 
 
 def in_loop(control: PredictiveControl, turbulence: np.ndarray, rng: np.random.Generator) -> np.ndarray:

@@ -17,6 +17,7 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from faintspot.base.errors import InputError
 from faintspot.loop.control.base import OpenLoopTelemetry
 from faintspot.loop.control.identification.recording import Recording
 from faintspot.loop.control.reconstructor import make_reconstructor
@@ -86,6 +87,10 @@ class BesideTheLoop(Generic[Result]):
         self._thread.start()
 
     def _run(self) -> None:
+        with contextlib.suppress(OSError, InputError):  # then there is no result
+            self._work_in_process()
+
+    def _work_in_process(self) -> None:
         code, write, read = self._work
         with tempfile.TemporaryDirectory(prefix="faintspot-learning-") as name:
             folder = Path(name)
