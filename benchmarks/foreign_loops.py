@@ -166,7 +166,7 @@ def table_of(results: list[dict[str, Any]]) -> str:
     for result in results:
         for part, ahead in result.get("ahead_of_parts", {}).items():
             lines.append(f"\n{result['name']}, {part}: filter - integrator {_signed(ahead[INTEGRATOR])}")
-    right = [result["report"]["is_best"] for result in results if "report" in result]
+    right = [result["report"]["is_best"] for result in results if result.get("report")]
     if right:
         lines.append(f"\nThe report's best control is the best in the loop in {sum(right)} of {len(right)}.")
     total = sum(result["seconds"] for result in results)
@@ -196,8 +196,8 @@ def _cells(result: dict[str, Any]) -> list[str]:
         ", ".join(_magnitudes(magnitudes[name]) for name in (INTEGRATOR, best) if name in magnitudes) or "-",
         f"{delay:.2f} ± {error:.2f}; {true_delay}",
         f"{gain:.3f} ± {gain_error:.3f}" + ("" if true_gain != true_gain else f"; {true_gain:.3f}"),
-        "{:.3f} ± {:.3f}; {:.3f}".format(*report["r0"]) if report["r0"] else "-",
-        "{}; {:.3g} ({:.3g} to {:.3g})".format(report["best"], *report["saves"]),
+        "{:.3f} ± {:.3f}; {:.3f}".format(*report["r0"]) if report and report["r0"] else "-",
+        "{}; {:.3g} ({:.3g} to {:.3g})".format(report["best"], *report["saves"]) if report else "-",
         f"{learnt['learning_s']:.1f} s, {learnt['frame_us']:.0f} us, {result['seconds']:.0f} s",
     ]
 

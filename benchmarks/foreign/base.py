@@ -67,6 +67,8 @@ class ForeignLoop(ABC):
         As given to the package.
     is_slow : bool
         Whether pyRTC and brighter stars are left out, and fewer gains tried.
+    is_modal : bool
+        Whether faintspot is not told the cells, as of sensors that have none.
     own : dict
         Reconstructors (commands, 2 n) that the package makes of the interaction matrix, if not the inverse.
     """
@@ -74,7 +76,7 @@ class ForeignLoop(ABC):
     name: str
     cells: NDArray[np.int64]
     interaction: Floats
-    sign, is_slow = 1.0, False
+    sign, is_slow, is_modal = 1.0, False, False
     rate_hz: float
     subaperture_m: float
     unit_arcsec: float

@@ -156,10 +156,10 @@ def recording_of(loop: ForeignLoop, observed: Observed) -> Any:
         slopes,
         commands,
         loop.interaction,
-        loop.cells,
+        None if loop.is_modal else loop.cells,
         loop.rate_hz,
         subaperture_m=loop.subaperture_m,
-        pixel_scale_arcsec=loop.unit_arcsec,
+        pixel_scale_arcsec=None if loop.is_modal else loop.unit_arcsec,
     )
 
 
@@ -173,15 +173,16 @@ def compared(ready: Commissioned, log: Log) -> dict[str, Any]:
     filtered = [loop.run(ready.fresh(), seed, effort.frames) for seed in effort.seeds]
     scores[FILTER] = [run.score for run in filtered]
     log(f"{FILTER}: {scores[FILTER]}")
-    recording = recording_of(loop, ready.learning)
-    report = reports.reported(recording, dict(scores), loop.r0_m)
-    log(f"report: {report['advice']} r0 {report['r0']}")
+    report = None
+    if not loop.is_modal:
+        report = reports.reported(recording_of(loop, ready.learning), dict(scores), loop.r0_m)
+        log(f"report: {report['advice']} r0 {report['r0']}")
     chosen = {INTEGRATOR: f"gain {ready.gain:g}", FILTER: ""}
     for name, matrix in loop.own.items():
         gain, _ = runs.best_gain(name, matrix)
         own = [runs.integrator(name, matrix, gain, seed, effort.frames).score for seed in effort.seeds]
         scores[name], chosen[name] = own, f"gain {gain:g}"
-    if effort.with_others and rivals.available():
+    if effort.with_others and rivals.available() and not loop.is_modal:
         for name in rivals.GRIDS:
             for text, gain in (("as calibrated", 1.0), ("gain corrected", _rounded(ready))):
                 label = f"pyRTC {name}, {text}"

@@ -17,7 +17,7 @@ from faintspot.loop.control.identification.vibrations import Vibration
 from faintspot.loop.turbulence.slope_covariance import ARCSEC
 
 _R0_M = 0.25  # of the turbulence that is simulated; another r0 scales it
-_POKE_M = 2e-8
+POKE_M = 2e-8
 CHANGED_AFTER = 700
 """Frames before the winds of a `ChangingLoop` change."""
 _TRUNCATED = 4
@@ -42,6 +42,8 @@ class OopaoCase:
     fault: str = ""
     """Change since the matrix was measured: "moved" (0.3 sub-apertures and 5 degrees), "dead" (one actuator),
     "columns" (gains of commands between 0.5 and 1.5)."""
+    is_modal: bool = False
+    """Whether faintspot is not told the geometry."""
 
 
 class OopaoLoop(SteppedLoop):
@@ -61,9 +63,9 @@ class OopaoLoop(SteppedLoop):
         super().__init__(folder, f"oopao-{case.diameter_m:g}")
         self._case, self.name, self.rate_hz = case, f"oopao-{case.name}", case.rate_hz
         self.delay_frames, self.subaperture_m = case.delay_frames, case.diameter_m / case.lenslets
-        self.r0_m = case.r0_m
+        self.r0_m, self.is_modal = case.r0_m, case.is_modal
         points = case.lenslets * case.lenslet_px
-        with _quiet():
+        with quiet():
             self._telescope = Telescope(
                 resolution=points,
                 diameter=case.diameter_m,
@@ -88,7 +90,7 @@ class OopaoLoop(SteppedLoop):
         pokes, self._tilt_of_signal = self._calibrate()
         self.interaction = pokes
         self.unit_arcsec = points / case.diameter_m / self._tilt_of_signal / ARCSEC
-        with _quiet():
+        with quiet():
             vault = CalibrationVault(pokes, nTrunc=_TRUNCATED)
         self.own = {} if case.fault else {"OOPAO's truncated inverse": np.asarray(vault.Mtrunc)}
         self._break()
@@ -104,7 +106,7 @@ class OopaoLoop(SteppedLoop):
         elif self._case.fault == "columns":
             self._factors = np.random.default_rng(0).uniform(0.5, 1.5, actuators)
         elif self._case.fault == "moved":
-            with _quiet():
+            with quiet():
                 change = MisRegistration()
                 change.shiftX, change.shiftY = 0.3 * self.subaperture_m * np.array([np.cos(1), np.sin(1)])
                 change.rotationAngle = 5.0
@@ -115,12 +117,12 @@ class OopaoLoop(SteppedLoop):
     def _calibrate(self) -> tuple[Floats, float]:
         """Return the interaction matrix, and the gain of slopes relative to true gradients."""
         columns, gradients = [], []
-        for poke in _POKE_M * np.eye(self._mirror.nValidAct):
+        for poke in POKE_M * np.eye(self._mirror.nValidAct):
             signals = [self._measured(command) for command in (poke, -poke)]
             gradients.append(-2 * self._gradients())
-            columns.append((signals[0] - signals[1]) / (2 * _POKE_M))
+            columns.append((signals[0] - signals[1]) / (2 * POKE_M))
         lit = self._fully_lit()
-        matrix, true = np.array(columns).T, np.array(gradients).T / (2 * _POKE_M)
+        matrix, true = np.array(columns).T, np.array(gradients).T / (2 * POKE_M)
         return matrix, float((matrix[lit] * true[lit]).sum() / np.square(true[lit]).sum())
 
     def _measured(self, command: Floats, path_m: Any = 0.0) -> Floats:
@@ -159,7 +161,7 @@ class OopaoLoop(SteppedLoop):
 
         paths_m = np.empty((frames, *self._pupil.shape), np.float32)
         speeds, directions = (list(values) for values in zip(*self.winds, strict=True))
-        with _quiet():
+        with quiet():
             layers = Atmosphere(
                 self._telescope,
                 r0=_R0_M,
@@ -253,5 +255,5 @@ def vibration(seed: int, frames: int, rate_hz: float) -> NDArray[np.float32]:
     return np.array(values[-frames:], np.float32)
 
 
-def _quiet() -> contextlib.redirect_stdout[io.StringIO]:
+def quiet() -> contextlib.redirect_stdout[io.StringIO]:
     return contextlib.redirect_stdout(io.StringIO())

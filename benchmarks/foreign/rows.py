@@ -44,6 +44,12 @@ def _changing(folder: Path, brightness: float) -> ForeignLoop:
     return ChangingLoop(replace(_FIRST, flux_e=_FIRST.flux_e * brightness), folder)
 
 
+def _pyramid(case: OopaoCase, folder: Path, brightness: float) -> ForeignLoop:
+    from benchmarks.foreign.oopao_pyramid import PyramidLoop
+
+    return PyramidLoop(replace(case, flux_e=case.flux_e * brightness), folder)
+
+
 def _specula(flux_e: float, own_slopes: bool, folder: Path, brightness: float) -> ForeignLoop:
     from benchmarks.foreign.specula import SpeculaLoop
 
@@ -63,6 +69,7 @@ def _soapy(folder: Path, brightness: float) -> ForeignLoop:
 
 
 _FIRST = OopaoCase("first")
+_PYRAMID = OopaoCase("bright", flux_e=1e5, read_noise_e=0.5)
 _MOVED, _DEAD, _COLUMNS = (OopaoCase(fault, fault=fault) for fault in ("moved", "dead", "columns"))
 _LARGE = OopaoCase("large", lenslets=16, lenslet_px=6, diameter_m=8.0, rate_hz=500.0)
 ROWS = (
@@ -94,6 +101,24 @@ ROWS = (
     Row("specula-own", "40 e-, SPECULA's own slopes", partial(_specula, 40.0, True), 0.725),
     Row("hcipy-40", "three of its layers, 40 e-, 1 e-", _hcipy),
     Row("soapy-40", "three of its infinite screens, 40 e-, 1 e-", _soapy),
+    Row("oopao-modes", "the first, no geometry told", partial(_oopao, replace(_FIRST, is_modal=True))),
+    Row(
+        "oopao-modes-vibration",
+        "the same with a tip of 45 Hz, 120 nm rms",
+        partial(_oopao, OopaoCase("vibration", vibration_nm=120.0, is_modal=True)),
+        0.605,
+    ),
+    Row("oopao-pyramid", "a pyramid, 100,000 e- a frame", partial(_pyramid, _PYRAMID)),
+    Row(
+        "oopao-pyramid-faint",
+        "a pyramid, 300 e- a frame",
+        partial(_pyramid, replace(_PYRAMID, name="faint", flux_e=300.0)),
+    ),
+    Row(
+        "oopao-pyramid-vibration",
+        "a pyramid, 10,000 e- a frame, a tip of 45 Hz, 120 nm rms",
+        partial(_pyramid, replace(_PYRAMID, name="vibration", flux_e=1e4, vibration_nm=120.0)),
+    ),
     Row("oopao-large", "8 m, 16 x 16, 500 Hz, r0 0.25 m, 20 e-, 3 e-", partial(_oopao, _LARGE)),
 )
 

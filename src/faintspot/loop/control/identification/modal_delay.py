@@ -30,9 +30,9 @@ Floats = NDArray[np.float64]
 
 _WINDOW, _LONG_WINDOW, _FOR_LONG = 128, 256, 3200  # frames, and consecutive ones for the long window
 _MOST_MODES = 8
-_KNEES, _POWER = (1e-3, 3e-3, 1e-2, 3e-2), 2.5
-"""Turbulence is a sum of (1 + (f / knee)^2)^-power, the knees in parts of the frame rate: between the powers
-of Zernike tilt, 11 / 6, and of the mean gradient, 17 / 6, of the pupil."""
+_KNEES, _POWER = (1e-3, 3e-3, 1e-2, 3e-2), 3.0
+"""Turbulence is a sum of (1 + (f / knee)^2)^-power, the knees in parts of the frame rate; a sum falls less
+steeply than each, as Zernike tilt does (power 11 / 6) and the mean gradient over a pupil (17 / 6)."""
 _STEP, _GAIN_STEPS, _UPDATES = 0.1, 36, 30
 _MOST_CONTRAST = 6.0  # of a frequency with more power than the model: vibrations count no more than that
 _CONTRADICTS = 10.0  # by how much more unlikely a delay is one that the recording contradicts

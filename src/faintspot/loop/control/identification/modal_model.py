@@ -71,7 +71,7 @@ def _autoregressions(model: Kalman, plant: LoopPlant, telemetry: OpenLoopTelemet
     modes = np.where(telemetry.trust > 0, telemetry.open_loop_px, np.nan)
     orders = best_orders(modes, plant.delay_frames)
     text = f"{orders.min()}" if orders.min() == orders.max() else f"{orders.min()} to {orders.max()}"
-    description = f"{len(orders)} modes, each an autoregression of order {text}"
+    description = f"{len(orders)} mode{'s' * (len(orders) > 1)}, autoregressions of order {text}"
     return replace(model, arrays=modal_filter(*spectra_of_modes(modes), orders), description=description)
 
 
