@@ -36,7 +36,7 @@ _MOST_SIGMAS = 5.0  # of the commands that the turbulence asks for
 _MOST_OFF = 1.5  # ratio of the recorded gain and the advised one, above which the fallback has the latter
 _MARGIN = 0.55  # of the largest stable loop gain, for the largest centroid gain that is likely
 _CORRECTIONS = 2  # of the matrix, each followed by learning
-_CLEARLY = 0.99  # part of what winds leave, below which modes alone replace them
+_CLEARLY = 0.9  # part of what winds leave, below which modes alone replace them
 
 
 def learn_loop(recording: Recording, start: Identified | None) -> tuple[LoopOfControl, Kalman]:
