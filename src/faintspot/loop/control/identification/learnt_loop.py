@@ -64,6 +64,23 @@ class ObservedLoop:
     """Identification of its open-loop slopes, if made already."""
 
 
+def learn_winds_again(recording: Recording, like: LoopOfControl) -> tuple[LoopOfControl, Kalman]:
+    """Learn the winds, and the centroid gain, of a loop whose delay, mirror and axes are known.
+
+    Raises
+    ------
+    InputError
+        As `learn_loop`.
+    """
+    ready = prepared(recording)
+    _, used = measured_delay(ready.recording)
+    n = len(like.scale) // 2
+    delay = replace(used, x_to_y=float(like.scale[n] / like.scale[0]))
+    observed = ObservedLoop(ready, delay, open_loop_of(ready.recording, delay))
+    described, learnt = _with_winds(observed, None)
+    return _controlling(_with_found_winds(described, learnt), ready, observed.seen, learnt)
+
+
 def learn_observed(observed: ObservedLoop, start: Identified | None = None) -> tuple[LoopOfControl, Kalman]:
     """Learn as `learn` from a recording whose delay and open-loop slopes are known."""
     described, learnt = _with_winds(observed, start)
@@ -76,10 +93,16 @@ def learn_observed(observed: ObservedLoop, start: Identified | None = None) -> t
             return _in_modes(ready, modes)
         description = f"{learnt.description}, modes alone leave {share:.2f} of what winds leave"
         learnt = replace(learnt, description=description)
-    described, identified = replace(described, law=modes.described.law), learnt.identified
-    if identified is not None and identified.is_layered:
-        described = replace(described, winds=np.array([wind.row() for wind in winds_of(identified)]))
+    described = replace(_with_found_winds(described, learnt), law=modes.described.law)
     return _controlling(described, ready, seen, learnt)
+
+
+def _with_found_winds(described: LoopOfControl, learnt: Kalman) -> LoopOfControl:
+    """Return the loop with the winds of its filter."""
+    identified = learnt.identified
+    if identified is None or not identified.is_layered:
+        return described
+    return replace(described, winds=np.array([wind.row() for wind in winds_of(identified)]))
 
 
 def _observed(ready: Prepared) -> ObservedLoop:

@@ -22,7 +22,12 @@ from faintspot.loop.control.identification.learning import (
     STANDARD_ERRORS,
     error_of_mean,
 )
-from faintspot.loop.control.identification.learnt_loop import ObservedLoop, learn_loop, learn_observed
+from faintspot.loop.control.identification.learnt_loop import (
+    ObservedLoop,
+    learn_loop,
+    learn_observed,
+    learn_winds_again,
+)
 from faintspot.loop.control.identification.loop_delay import LoopDelay
 from faintspot.loop.control.identification.modal_loop import LEAST_MEASURED
 from faintspot.loop.control.identification.model import Kalman, state_space, write_matrices
@@ -256,7 +261,12 @@ class PredictiveControl:
         """
         frames = len(recording.slopes)
         first = frames - round(JUDGED_PART * frames)
-        new = learn(recording.part(slice(0, first)))
+        part = recording.part(slice(0, first))
+        new = (
+            learn(part)
+            if self._loop.analysis.size
+            else PredictiveControl(*learn_winds_again(part, self._loop))
+        )
         loop, begin = new._loop, max(0, first - SETTLE_FRAMES)
         rest, delay = recording.part(slice(begin, None)), new._plant.delay_frames
         matrix = loop.slopes_of_commands
