@@ -46,6 +46,7 @@ _ORDER = (
     "large_sensors",
     "layouts",
     "wavefronts",
+    "metrology",
     "yardstick",
     "startup",
     "loaded",
@@ -61,6 +62,7 @@ LONG = {
     "large_sensors",
     "layouts",
     "wavefronts",
+    "metrology",
     "yardstick",
 }
 """Run only when named, or with --full: 5 minutes to an hour each, one with a recording of its own."""

@@ -32,6 +32,8 @@ WITHOUT_EXAMPLE = {
     "faintspot.slopes.training.CentroidGain": "in that of measure_centroid_gain",
     "faintspot.slopes.training.SodiumFit": "in that of fit_sodium_profile",
     "faintspot.slopes.training.LearntPSF": "in that of learn_psf_from_images",
+    "faintspot.slopes.wavefront.Certificate": "in that of certify",
+    "faintspot.slopes.wavefront.Drift": "in that of fit_drift",
     "faintspot.slopes.wavefront.Discrepancy": "in that of slope_discrepancy",
     "faintspot.slopes.estimators.Sensor": "made by a pipeline, in that of Estimator",
 }

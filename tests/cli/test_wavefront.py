@@ -10,12 +10,13 @@ from tests.cli.cli_cases import CONFIGURATION, Commands, simulated
 from tests.slopes.wavefront.test_fit import slopes_of
 
 from faintspot import Layout
-from faintspot.base.json_text import parse_json
+from faintspot.base.json_text import parse_json, plain_values
 from faintspot.cli.wavefront import _with_error_of
 from faintspot.io import read_slopes
 from faintspot.slopes.pipeline.configuration import to_text
 from faintspot.slopes.pipeline.slopes import Slopes
-from faintspot.slopes.wavefront import fit_wavefront
+from faintspot.slopes.wavefront import certify, fit_wavefront
+from faintspot.slopes.wavefront.files import certificate_records
 
 SCALES = ("--pixel-scale-arcsec", 0.4, "--diameter-m", 4.2)
 
@@ -28,10 +29,9 @@ def slopes(run: Commands, folder: Path, coarse_pictures: None) -> Path:
 
 
 def test_table_picture_and_files(run: Commands, slopes: Path) -> None:
-    out = run.ok("wavefront", slopes, *SCALES, "-o", "w.json").out
+    out = run.ok("wavefront", slopes, *SCALES, "--wavelength-nm", 700, "-o", "w.json").out
     assert "defocus" in out
     assert "mean (nm)" in out
-    assert "mean wavefront" in out
     assert f"picture: {slopes.parent / 'slopes_wavefront.png'}" in out
     layout = Layout.grid((4, 4), pixels=8, pixel_scale_arcsec=0.4, diameter_m=4.2)
     expected = fit_wavefront(Slopes.from_variables(read_slopes(slopes).variables), layout)
@@ -46,7 +46,25 @@ def test_table_picture_and_files(run: Commands, slopes: Path) -> None:
     np.testing.assert_allclose(written["frames"]["rms_without_tilt"], expected.rms(tilt=False))
     np.testing.assert_allclose(written["frames"]["standard_errors"], expected.standard_errors)
     np.testing.assert_allclose(written["frames"]["residual_px"], expected.residual_px)
-    assert written["mean"]["rms"] == pytest.approx(np.sqrt(np.sum(expected.mean**2)))
+    assert written["mean"]["certificate"] == plain_values(
+        certificate_records(certify(expected, wavelength_nm=700.0))
+    )
+    assert written["mean"]["wavelength_nm"] == 700.0
+    assert "Strehl ratio at 700 nm" in out
+
+
+def test_drift_of_a_recording(run: Commands, slopes: Path, coarse_pictures: None) -> None:
+    asked = ("--drift", 3, "--frame-rate-hz", 0.01)
+    out = run.ok("wavefront", slopes, *SCALES, *asked, "--modes", 5, "-o", "w.json").out
+    assert "nm/h" in out
+    assert Path("slopes_drift.png").exists()
+    written = parse_json(Path("w.json").read_text())
+    coefficients = np.array(written["frames"]["coefficients"])
+    np.testing.assert_allclose(written["drift"]["mean"], coefficients.reshape(3, 2, 5).mean(axis=1))
+    np.testing.assert_allclose(written["drift"]["time"], np.array([0.5, 2.5, 4.5]) / 36)
+    slope = np.polyfit(written["drift"]["time"], written["drift"]["mean"], 1)[0]
+    np.testing.assert_allclose(written["drift"]["rate"], slope)
+    run.refused("wavefront", slopes, "--drift", 4, naming=("bins", "3"))
 
 
 def test_unknown_values_are_null_with_a_reason(run: Commands, folder: Path, no_picture: None) -> None:
@@ -58,7 +76,7 @@ def test_unknown_values_are_null_with_a_reason(run: Commands, folder: Path, no_p
     written = parse_json(Path("w.json").read_text())
     assert written["pupil_radius_m"] is None
     assert written["frames"]["coefficients"][1] == [None] * 9
-    assert set(written["unknown"]) == {"pupil_radius_m", "frames"}
+    assert set(written["unknown"]) == {"pupil_radius_m", "frames", "strehl"}
 
 
 def test_without_scales_it_says_its_unit(run: Commands, slopes: Path) -> None:
@@ -105,7 +123,7 @@ def test_difference_of_two_recordings(run: Commands, slopes: Path, no_picture: N
     asked = ("--modes", 2, "-o", "w.json")
     run.ok("wavefront", slopes, "--minus", slopes, *asked)
     nothing = parse_json(Path("w.json").read_text())["mean"]
-    assert nothing["rms"] == pytest.approx(0, abs=1e-6)
+    assert nothing["certificate"]["rms"]["value"] == pytest.approx(0, abs=1e-6)
     np.save("moved.npy", np.roll(np.load("frames.npy"), 1, axis=2))
     run.ok("slopes", "moved.npy", "-o", "moved.npz")
     run.ok("wavefront", "moved.npz", "--minus", slopes, *asked)
@@ -147,6 +165,7 @@ def test_displaced_source_is_a_tilt(run: Commands, slopes: Path, no_picture: Non
     for name, reference in (("flat", ()), ("frames", ()), ("relative", ("--reference", "flat.npz"))):
         frames = "flat.npy" if name == "flat" else "frames.npy"
         run.ok("slopes", frames, "-c", "fitted.toml", *reference, "-o", f"{name}.npz")
+    errors = []
     for asked in (("relative.npz",), ("frames.npz", "--minus", "flat.npz")):
         out = run.ok("wavefront", *asked, "--modes", 5, "-o", "w.json").out
         wavefront = parse_json(Path("w.json").read_text())
@@ -155,6 +174,11 @@ def test_displaced_source_is_a_tilt(run: Commands, slopes: Path, no_picture: Non
         assert means[0] == pytest.approx(-wavefront["pupil_radius_subapertures"], abs=0.15)
         np.testing.assert_allclose(means[1:], 0, atol=0.1)
         assert "slopes lack" not in out
+        errors.append([mode["standard_error"] for mode in wavefront["mean"]["modes"]])
+    # Errors of the reference count either way; without them they would be a factor of 1.4 smaller.
+    np.testing.assert_allclose(errors[0], errors[1], rtol=0.2)
+    Path("flat.npz").unlink()
+    assert "flat.npz is taken as exact" in run.ok("wavefront", "relative.npz").out
     assert "slopes lack that frame's tilt" in run.ok("wavefront", "frames.npz").out
 
 

@@ -18,11 +18,18 @@ from faintspot.cli.shared.output import picture_file, write_picture
 from faintspot.io.frames import read_array
 from faintspot.loop.control.flattening import Flattening, check_command_file, flattening, save_command
 from faintspot.slopes.pipeline.slopes import Slopes
-from faintspot.slopes.recorded.stored_run import difference, open_run
+from faintspot.slopes.recorded.stored_run import StoredRun, difference, open_run
 from faintspot.slopes.sensor.layout import OPTICS, Layout
-from faintspot.slopes.wavefront import Wavefront, fit_wavefront, save_wavefront
+from faintspot.slopes.wavefront import Wavefront, certify, fit_drift, fit_wavefront, save_wavefront
+from faintspot.slopes.wavefront.drift import drift_figure
 from faintspot.slopes.wavefront.figure import wavefront_map
-from faintspot.slopes.wavefront.files import check_wavefront_file, mode_table, remarks, rms_table
+from faintspot.slopes.wavefront.files import (
+    certificate_table,
+    check_wavefront_file,
+    drift_table,
+    mode_table,
+    remarks,
+)
 from faintspot.slopes.wavefront.fit import NM, total
 
 if TYPE_CHECKING:
@@ -41,6 +48,9 @@ if TYPE_CHECKING:
     show_default="by the sensor",
 )
 @option("--minus", metavar="SLOPES", help="Slopes of a recording whose mean wavefront is subtracted.")
+@option("--drift", type=int, metavar="BINS", help="Drift of the modes, as means of so many bins of frames.")
+@option("--frame-rate-hz", type=float, metavar="HZ", help="Frame rate, for the drift per hour.")
+@option("--wavelength-nm", type=float, metavar="NM", help="Wavelength of the Strehl ratio.")
 @option(
     "--actuators",
     metavar="FILE",
@@ -63,6 +73,9 @@ def command(
     picture: str | None,
     modes: int | None,
     minus: str | None,
+    drift: int | None,
+    frame_rate_hz: float | None,
+    wavelength_nm: float | None,
     actuators: str | None,
     stroke: float | None,
     command_file: str | None,
@@ -71,14 +84,16 @@ def command(
     """Fit Zernike modes to slopes, draw the wavefront, and find the command that would flatten it.
 
     SLOPES is what `faintspot slopes` wrote (.zarr, .fits, .npz). Each frame is fitted by least squares over
-    its valid sub-apertures; the table shows the mean, with standard errors. In nm when the pixels' scale and
-    the size of a sub-aperture or of the telescope are known, from `faintspot layout` or the options here.
+    its valid sub-apertures; the tables show the mean, with standard errors, and its PV, rms, vergence and
+    Strehl ratio with 95 % intervals. In nm when the pixels' scale and the size of a sub-aperture or of the
+    telescope are known, from `faintspot layout` or the options here.
 
     \b
     Examples:
       faintspot wavefront slopes.zarr
       faintspot wavefront slopes.zarr --pixel-scale-arcsec 0.38 --diameter-m 4.2 -o wavefront.json
       faintspot wavefront warm.zarr --minus cold.zarr
+      faintspot wavefront slopes.zarr --drift 24 --frame-rate-hz 0.5
       faintspot wavefront slopes.zarr --actuators interaction.npy --stroke 300
       faintspot wavefront slopes.zarr --actuators faintspot.control.npz:interaction_matrix
     """
@@ -95,35 +110,54 @@ def command(
         raise InputError(f"{slopes}: expected slopes with their layout ({' '.join(run.notes)})")
     given: dict[str, Any] = {name: value for name, value in scales.items() if value is not None}
     layout = replace(run.layout, **given)
+    # A difference of positions in the frame lacks nothing.
+    notes = [note for note in run.notes if minus is None or note != run.about_reference]
     measured, other = Slopes.from_variables(run.stored.variables, keep=run.keep), None
-    if minus is not None:
+    if minus is None:
+        other = _reference(run, notes)
+    else:
         measured, other = difference(run, open_run(Path(minus)))
     with errors_of_options(slopes):
         wavefront = fit_wavefront(measured, layout, modes=modes)
     if other is not None:
-        with errors_of_options(minus):
+        with errors_of_options(minus or slopes):
             wavefront = _with_error_of(other, layout, wavefront)
     with errors_of_options(actuators):
         flat = None if interaction is None else flattening(measured, interaction, stroke)
-    # A difference of positions in the frame lacks nothing.
-    notes = [note for note in run.notes if minus is None or note != run.about_reference]
-    _print(wavefront, notes)
+    found = certify(wavefront, wavelength_nm=wavelength_nm)
+    with errors_of_options(slopes):
+        over_time = drift and fit_drift(wavefront, drift, frame_rate_hz=frame_rate_hz)
+    tables = [mode_table(wavefront), certificate_table(found, wavefront.unit)]
+    _print([*tables, drift_table(over_time, wavefront)] if over_time else tables, wavefront, notes)
     if output is not None:
-        save_wavefront(output, wavefront)
+        save_wavefront(output, wavefront, found, over_time or None)
         click.echo(output)
     if drawing is not None:
         from faintspot.slopes.wavefront.figure import wavefront_figure
 
         title = Path(slopes).name + ("" if minus is None else f" minus {Path(minus).name}")
         write_picture(wavefront_figure(wavefront, layout, title).figure, drawing)
+        if over_time:
+            write_picture(drift_figure(over_time, wavefront, title), derived(slopes, "_drift.png"))
     if flat is not None:
         _write_flattening(flat, target, measured, wavefront, layout)
 
 
+def _reference(run: StoredRun, notes: list[str]) -> Slopes | None:
+    """Return the slopes of the recording that was the reference; add a note if it is taken as exact."""
+    file = str(run.stored.attributes.get("reference_file", ""))
+    if not file:
+        return None
+    try:
+        return difference(run, open_run(Path(file)))[1]
+    except InputError as error:
+        notes.append(f"The reference {file} is taken as exact: {error}.")
+        return None
+
+
 def _with_error_of(other: Slopes, layout: Layout, wavefront: Wavefront) -> Wavefront:
     """Return a wavefront from which another was subtracted, with the errors of both."""
-    fitted = fit_wavefront(other, layout, modes=len(wavefront.modes))
-    return replace(wavefront, other_standard_error=fitted.mean_standard_error)
+    return replace(wavefront, subtracted=fit_wavefront(other, layout, modes=len(wavefront.modes)))
 
 
 def _write_flattening(
@@ -146,12 +180,12 @@ def _write_flattening(
         write_picture(flattening_figure(flat, wavefront, after, layout), target.with_suffix(".png"))
 
 
-def _print(wavefront: Wavefront, notes: list[str]) -> None:
+def _print(tables: list[tuple[list[str], list[list[str]]]], wavefront: Wavefront, notes: list[str]) -> None:
     from rich.console import Console
     from rich.table import Table
 
     console = Console()
-    for header, rows in (mode_table(wavefront), rms_table(wavefront)):
+    for header, rows in tables:
         table = Table(box=None, pad_edge=False)
         words = 2 if header[0] == "Noll" else 1
         for place, title in enumerate(header):

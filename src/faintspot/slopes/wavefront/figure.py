@@ -11,7 +11,7 @@ from faintspot.base.report.plots import GREY, METHOD_COLOURS, Drawing, Line, Pan
 from faintspot.slopes.sensor.drawing import Outlines
 from faintspot.slopes.sensor.layout import Layout
 from faintspot.slopes.sensor.pupil import lenslet_outlines
-from faintspot.slopes.wavefront.fit import Wavefront, total
+from faintspot.slopes.wavefront.fit import Wavefront
 from faintspot.slopes.wavefront.zernike import mode_name, osa_index
 
 _MOST_OUTLINED = 1500
@@ -34,7 +34,7 @@ def wavefront_figure(
     if higher:
         panels.append(_coefficients(wavefront, slice(2, None), several, 2 - share))
     caption = (
-        f"{subject.capitalize()} over the disk of the pupil, in the frame's directions, with the illuminated "
+        f"{subject.capitalize()} over the lit pupil, in the frame's directions, with the illuminated "
         "sub-apertures outlined; it increases in the direction in which spots are displaced. Below: its "
         "coefficients ± standard error, with the names of the modes and their indices (Noll | OSA/ANSI)"
         + (", and in grey the rms of each over the frames (motion and noise)." if several else ".")
@@ -49,9 +49,8 @@ def wavefront_map(
 ) -> Picture:
     """Return the mean wavefront at its position in the frame, with the illuminated sub-apertures outlined.
 
-    Its rms follows the title. Colours go to `largest` on both sides; 0: to the largest value.
+    Colours go to `largest` on both sides; 0: to the largest value.
     """
-    title = f"{title}: {total(wavefront.mean, tilt=tilt):.3g} {wavefront.unit} rms"
     sheet, pupil, unit = wavefront.sheet(tilt=tilt), wavefront.pupil, wavefront.unit
     (x, y), radius = pupil.centre_px, pupil.radius_px
     largest = largest or float(np.nanmax(np.abs(sheet))) or 1.0

@@ -9,17 +9,20 @@ import numpy as np
 
 from faintspot.base.files import check_ending, write_atomically
 from faintspot.base.json_text import to_json
-from faintspot.base.report.texts import Texts, number_or_dash, signed
+from faintspot.base.report.texts import NOTHING, Texts, number_or_dash, signed
+from faintspot.base.statistics import Estimate
+from faintspot.slopes.wavefront.certificate import Certificate, certify
+from faintspot.slopes.wavefront.drift import Drift
 from faintspot.slopes.wavefront.fit import NM, Floats, Wavefront, total
 from faintspot.slopes.wavefront.zernike import mode_name, noll_to_nm, osa_index
 
 _TEXT = Texts("faintspot.slopes.wavefront")
-_TILTS = (True, False)
 
 
 def mode_records(wavefront: Wavefront) -> list[dict[str, Any]]:
-    """Return each mode of the mean wavefront: indices, name, coefficient and standard error."""
-    modes = zip(wavefront.modes.tolist(), wavefront.mean, wavefront.mean_standard_error, strict=True)
+    """Return each mode of the mean wavefront: indices, name, coefficient, standard error, interval."""
+    values = wavefront.mean, wavefront.mean_standard_error, wavefront.mean_half_width
+    modes = zip(wavefront.modes.tolist(), *values, strict=True)
     return [
         {
             "noll": j,
@@ -28,8 +31,10 @@ def mode_records(wavefront: Wavefront) -> list[dict[str, Any]]:
             "name": mode_name(j),
             "mean": mean,
             "standard_error": error,
+            "low": mean - half,
+            "high": mean + half,
         }
-        for j, mean, error in modes
+        for j, mean, error, half in modes
     ]
 
 
@@ -46,28 +51,39 @@ def mode_table(wavefront: Wavefront) -> tuple[list[str], list[list[str]]]:
     return [*header, f"rms of frames ({unit})"] if several else header, rows
 
 
-def rms_table(wavefront: Wavefront) -> tuple[list[str], list[list[str]]]:
-    """Return header and rows: rms over the disk of the mean wavefront and of the frames, and noise."""
-    several = np.count_nonzero(wavefront.fitted) > 1
-    noise = np.sqrt(np.mean(wavefront.standard_errors[wavefront.fitted] ** 2, axis=0))
-    coefficients = {"mean wavefront" if several else "wavefront": wavefront.mean}
-    errors = [wavefront.mean_standard_error, noise]
-    if several:
-        coefficients["frames, quadratic mean"] = wavefront.rms_of_frames
-    digits = _decimals(np.array([total(values) for values in coefficients.values()]))
+def certificate_table(found: Certificate, unit: str) -> tuple[list[str], list[list[str]]]:
+    """Return header and rows: each known number of a certificate with its 95 % interval."""
     rows = [
         [
-            name,
-            *(
-                number_or_dash(float(total(part, tilt=tilt)), digits)
-                for part in pair
-                for tilt in (True, False)
-            ),
+            _TEXT(f"certificate.{name}", found, unit=unit),
+            *(f"{number:.4g}" if np.isfinite(number) else NOTHING for number in numbers.values()),
         ]
-        for (name, *pair) in zip(coefficients, coefficients.values(), errors, strict=False)
+        for name, numbers in certificate_records(found).items()
+        if np.isfinite(numbers["value"])
     ]
-    header = [f"rms over the pupil ({wavefront.unit})", "all modes", "no tip, tilt"]
-    return [*header, "standard error", "no tip, tilt"], rows
+    return [_TEXT["certificate.title"], "value", "± standard error", "from", "to"], rows
+
+
+def drift_table(found: Drift, wavefront: Wavefront) -> tuple[list[str], list[list[str]]]:
+    """Return header and rows: the linear drift of each mode with its standard error and 95 % interval."""
+    rate, half = found.rate, found.rate_half_width
+    numbers = np.stack([rate, found.rate_standard_error, rate - half, rate + half], axis=1)
+    rows = [
+        [f"Z{j}", mode_name(j), *(f"{value:.3g}" for value in row)]
+        for j, row in zip(wavefront.modes.tolist(), numbers, strict=True)
+    ]
+    unit = f"{wavefront.unit}/{found.time_unit}"
+    return ["Noll", "name", f"drift ({unit})", "± standard error", "from", "to"], rows
+
+
+def certificate_records(found: Certificate) -> dict[str, dict[str, float]]:
+    """Return value, standard error and ends of the 95 % interval of each number of a certificate."""
+    names = "value", "standard_error", "low", "high"
+    return {
+        key: {name: getattr(number, name) for name in names}
+        for key, number in vars(found).items()
+        if isinstance(number, Estimate)
+    }
 
 
 def remarks(wavefront: Wavefront) -> list[str]:
@@ -85,6 +101,9 @@ def remarks(wavefront: Wavefront) -> list[str]:
         has_errors=wavefront.errors_from == "slopes",
         without=wavefront.left_out.capitalize() or None,
         several=fitted > 1,
+        of_frames=float(total(wavefront.rms_of_frames)),
+        without_tilt=float(total(wavefront.rms_of_frames, tilt=False)),
+        noise=float(np.sqrt(np.trace(wavefront.noise_covariance))),
         frames=len(wavefront.fitted),
         lost=len(wavefront.fitted) - fitted or None,
         scatter=float(np.sqrt(np.mean(wavefront.residual_px[wavefront.fitted] ** 2))),
@@ -97,15 +116,21 @@ def _decimals(values: Floats) -> int:
     return 3 if largest == 0 else int(np.clip(3 - np.floor(np.log10(largest)), 0, 6))
 
 
-def save_wavefront(path: str | Path, wavefront: Wavefront) -> None:
+def save_wavefront(
+    path: str | Path, wavefront: Wavefront, found: Certificate | None = None, drift: Drift | None = None
+) -> None:
     """Write a wavefront to a file, replacing an existing one.
 
     Parameters
     ----------
     path : path
-        .json: unit, pupil, modes, and rms, coefficients and standard errors of the mean and of each frame;
-        null for a frame that could not be fitted.
+        .json: unit, pupil, modes and certificate of the mean with 95 % intervals, and rms, coefficients and
+        standard errors of each frame; null for a frame that could not be fitted.
     wavefront : Wavefront
+    found : Certificate, optional
+        Default: that of the wavefront, without Strehl ratio.
+    drift : Drift, optional
+        Modes against time.
 
     Raises
     ------
@@ -126,7 +151,10 @@ def save_wavefront(path: str | Path, wavefront: Wavefront) -> None:
     """
     path = Path(path)
     check_wavefront_file(path)
-    write_atomically(path, to_json(_values(wavefront), indent=1))
+    over_time = {} if drift is None else {"drift": vars(drift)}
+    write_atomically(
+        path, to_json({**_values(wavefront, found or certify(wavefront)), **over_time}, indent=1)
+    )
 
 
 def check_wavefront_file(path: Path) -> None:
@@ -134,7 +162,7 @@ def check_wavefront_file(path: Path) -> None:
     check_ending(path, ".json")
 
 
-def _values(wavefront: Wavefront) -> dict[str, Any]:
+def _values(wavefront: Wavefront, found: Certificate) -> dict[str, Any]:
     """Return a wavefront as plain values, with the reasons for those that are not known."""
     values = {
         "unit": wavefront.unit,
@@ -144,8 +172,8 @@ def _values(wavefront: Wavefront) -> dict[str, Any]:
         "condition": wavefront.condition,
         "left_out": wavefront.left_out,
         "mean": {
-            "rms": float(total(wavefront.mean)),
-            "rms_without_tilt": float(total(wavefront.mean, tilt=False)),
+            "certificate": certificate_records(found),
+            "wavelength_nm": found.wavelength_nm,
             "modes": mode_records(wavefront),
         },
         "frames": {
@@ -156,7 +184,7 @@ def _values(wavefront: Wavefront) -> dict[str, Any]:
             "standard_errors": wavefront.standard_errors,
         },
     }
-    unknown = {}
+    unknown = dict(_TEXT.facts("unknown", found, wavelength=found.wavelength_nm is None))
     if wavefront.pupil.radius_m is None:
         unknown["pupil_radius_m"] = "the layout has neither subaperture_m nor diameter_m"
     if not wavefront.fitted.all():

@@ -6,6 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+from scipy.stats import t as student
 
 from faintspot.base.checks import number_between
 from faintspot.base.errors import InputError
@@ -26,6 +28,7 @@ LARGEST_CONDITION = 100.0
 _HIGHEST_ORDER, _USUAL_CONDITION = 8, 20.0  # defaults; higher orders are rarely needed
 _TILTS = 2
 _FEWEST_SUBAPERTURES = 3  # two show no surface
+_ROUNDING = 1e-9  # of lengths in radii
 _LEAST_SHARE = 0.1  # of a sub-aperture's area in the pupil, below which its slope tells too little
 
 
@@ -48,8 +51,15 @@ class Wavefront:
     """Rms of the slopes about the fitted modes, px per axis, (n_frames,)."""
     condition: float
     """Condition number of the fit with every sub-aperture that is ever valid."""
-    other_standard_error: Floats | None = None
-    """Standard error of a mean wavefront that was subtracted, (k,)."""
+    noise_covariance: Floats
+    """Covariance of one frame's coefficients from the slopes' noise, (k, k), mean over the frames; NaN if
+    unknown."""
+    freedom: float
+    """Degrees of freedom of one frame's standard errors; infinite for those of the slopes."""
+    outlines: Floats
+    """Corners of the sub-apertures with valid slopes, (m, corners, 2), in radii from the pupil's centre."""
+    subtracted: Wavefront | None = None
+    """Wavefront of the reference, whose errors count as well."""
     unit: str
     """Unit: "nm", or "px × sub-aperture" (slopes in pixels, lengths in sub-apertures)."""
     pupil: Pupil
@@ -73,12 +83,58 @@ class Wavefront:
     @property
     def mean_standard_error(self) -> Floats:
         """Standard error of the mean, (k,), from the scatter over frames; for one frame, its own."""
-        kept = self.coefficients[self.fitted]
-        if len(kept) == 1:
-            error: Floats = self.standard_errors[self.fitted][0]
-        else:
-            error = kept.std(axis=0, ddof=1) / np.sqrt(len(kept))
-        return error if self.other_standard_error is None else np.hypot(error, self.other_standard_error)
+        error: Floats = np.sqrt(np.diag(self.mean_covariance))
+        return error
+
+    @property
+    def mean_covariance(self) -> Floats:
+        """Covariance of the mean's errors, (k, k), including those of the reference.
+
+        For several frames, variances are those of their scatter. Correlations are those of the scatter and,
+        with the weight of k frames, those of the slopes' noise: few frames do not determine them.
+        """
+        own = self._own_covariance
+        return own if self.subtracted is None else own + self.subtracted.mean_covariance
+
+    @property
+    def _own_covariance(self) -> Floats:
+        kept, noise = self.coefficients[self.fitted], self.noise_covariance
+        frames, k = kept.shape
+        if frames == 1:
+            return noise
+        scatter = np.cov(kept, rowvar=False)
+        deviation = np.sqrt(np.diag(scatter) / frames)
+        by_noise = _correlations(noise if np.isfinite(noise).all() else scatter)
+        weight = k / (k + frames - 1)
+        correlations = weight * by_noise + (1 - weight) * _correlations(scatter)
+        covariance: Floats = correlations * np.outer(deviation, deviation)
+        return covariance
+
+    @property
+    def degrees_of_freedom(self) -> Floats:
+        """Degrees of freedom of `mean_standard_error`, (k,); with a reference by Welch (1947)."""
+        frames = int(np.count_nonzero(self.fitted))
+        own = np.full(len(self.modes), frames - 1.0 if frames > 1 else self.freedom)
+        if self.subtracted is None:
+            return own
+        parts = np.diag(self._own_covariance), np.diag(self.subtracted.mean_covariance)
+        squares = parts[0] ** 2 / own + parts[1] ** 2 / self.subtracted.degrees_of_freedom
+        both = (parts[0] + parts[1]) ** 2
+        return np.asarray(np.divide(both, squares, out=np.full(len(own), np.inf), where=squares > 0))
+
+    @property
+    def mean_half_width(self) -> Floats:
+        """Half width of the 95 % interval of the mean, (k,), by Student's distribution."""
+        width: Floats = student.ppf(0.975, self.degrees_of_freedom) * self.mean_standard_error
+        return width
+
+    def is_lit(self, x: Floats, y: Floats) -> NDArray[np.bool_]:
+        """Return which points (p,), in radii, lie within the disk and a sub-aperture with valid slopes."""
+        points = np.stack([x, y], axis=-1)
+        nearest = self.outlines[cKDTree(self.outlines.mean(axis=1)).query(points)[1]]
+        edges, away = np.roll(nearest, -1, axis=1) - nearest, points[:, None] - nearest
+        left = edges[..., 0] * away[..., 1] - edges[..., 1] * away[..., 0]
+        return np.asarray((left >= -_ROUNDING).all(axis=1) & (np.hypot(x, y) <= 1 + _ROUNDING))
 
     @property
     def rms_of_frames(self) -> Floats:
@@ -91,7 +147,7 @@ class Wavefront:
         return total(self.coefficients, tilt=tilt)
 
     def sheet(self, *, points: int = _POINTS, tilt: bool = True) -> Floats:
-        """Return the mean wavefront as a map over the disk, (points, points), NaN outside.
+        """Return the mean wavefront as a map over the lit pupil, (points, points), NaN outside.
 
         Parameters
         ----------
@@ -102,13 +158,20 @@ class Wavefront:
         """
         line = np.linspace(-1.0, 1.0, points)
         y, x = np.meshgrid(line, line, indexing="ij")
-        inside = np.hypot(x, y) <= 1
+        inside = self.is_lit(x.ravel(), y.ravel()).reshape(x.shape)
         sheet = np.full((points, points), np.nan)
         sheet[inside] = 0.0
         start = 0 if tilt else _TILTS
         for j, value in zip(self.modes[start:], self.mean[start:], strict=True):
             sheet[inside] += value * zernike(int(j), x[inside], y[inside])
         return sheet
+
+
+def _correlations(covariance: Floats) -> Floats:
+    """Return the correlations of a covariance (k, k); those of constant coefficients are 0."""
+    deviation = np.sqrt(np.diag(covariance))
+    scale = np.outer(deviation, deviation)
+    return np.asarray(np.divide(covariance, scale, out=np.eye(len(scale)), where=scale > 0))
 
 
 def total(coefficients: Floats, *, tilt: bool = True) -> Floats:
@@ -177,7 +240,7 @@ def fit_wavefront(slopes: Slopes, layout: Layout, *, modes: int | None = None) -
     has_errors = bool(np.isfinite(errors[used]).all())
     noise = np.square(errors, dtype=np.float64), np.atleast_2d(slopes.covariance_xy).astype(np.float64)
     measured = np.concatenate([x, y], axis=1).astype(np.float64)
-    coefficients, standard_errors, residual = _fit(
+    coefficients, standard_errors, residual, covariance = _fit(
         measured, used, gradients, share, noise if has_errors else None
     )
     return Wavefront(
@@ -186,6 +249,9 @@ def fit_wavefront(slopes: Slopes, layout: Layout, *, modes: int | None = None) -
         standard_errors=scale * standard_errors,
         residual_px=residual,
         condition=condition,
+        noise_covariance=scale**2 * covariance,
+        freedom=np.inf if has_errors else 2.0 * np.count_nonzero(illuminated) - gradients.shape[1],
+        outlines=(lenslet_outlines(layout)[illuminated] - pupil.centre_px) / pupil.radius_px,
         unit=unit,
         pupil=pupil,
         errors_from="slopes" if has_errors else "residuals",
@@ -255,16 +321,17 @@ def _fit(
     gradients: Floats,
     share: Floats,
     noise: tuple[Floats, Floats] | None,
-) -> tuple[Floats, Floats, Floats]:
-    """Return coefficients, their standard errors and the residuals' rms, for a radius and px of 1.
+) -> tuple[Floats, Floats, Floats, Floats]:
+    """Return coefficients, standard errors, residuals' rms and mean covariance for a radius and px of 1.
 
     Frames with the same valid sub-apertures share one inverse. `noise` are the slopes' variances, all x, then
     all y, and the covariances of x and y; without it, it is estimated from the residuals.
     """
     weights = np.tile(share, 2)
-    coefficients, errors, residual = _weighted_fit(slopes, valid, gradients, weights, noise)
+    fit = _weighted_fit(slopes, valid, gradients, weights, noise)
+    residual = fit[2]
     if noise is None or not np.isfinite(residual).any():
-        return coefficients, errors, residual
+        return fit
     variance = np.where(valid, noise[0], 0.0).sum(axis=0) / np.maximum(valid.sum(axis=0), 1)
     seen = valid.any(axis=0)
     unfitted = max(float(np.nanmean(residual**2) - variance[seen].mean()), 0.0)
@@ -278,11 +345,11 @@ def _weighted_fit(
     gradients: Floats,
     weights: Floats,
     noise: tuple[Floats, Floats] | None,
-) -> tuple[Floats, Floats, Floats]:
+) -> tuple[Floats, Floats, Floats, Floats]:
     """Return what `_fit` does for the given weights of the slopes, (2 n,)."""
     frames, k = len(slopes), gradients.shape[1]
     coefficients, standard_errors = np.full((frames, k), np.nan), np.full((frames, k), np.nan)
-    residual = np.full(frames, np.nan)
+    residual, total_covariance = np.full(frames, np.nan), np.zeros((k, k))
     patterns, of_frame = np.unique(np.packbits(valid, axis=1), axis=0, return_inverse=True)
     for number in range(len(patterns)):
         rows = np.flatnonzero(of_frame.ravel() == number)
@@ -303,10 +370,16 @@ def _weighted_fit(
             variance = noise[0][np.ix_(rows, used)] @ (inverse**2).T
             covariance = noise[1][np.ix_(rows, used[: len(used) // 2])]
             variance = variance + 2 * covariance @ (along * across).T
+            mixed = (along * covariance.sum(axis=0)) @ across.T
+            total_covariance += (inverse * noise[0][np.ix_(rows, used)].sum(axis=0)) @ inverse.T
+            total_covariance += mixed + mixed.T
         elif freedom > 0:
             of_slopes = np.sum((root * residuals) ** 2, axis=1, keepdims=True) / freedom
             variance = of_slopes * np.sum((inverse / root) ** 2, axis=1)
+            total_covariance += of_slopes.sum() * (inverse / root) @ (inverse / root).T
         else:
+            total_covariance += np.nan
             continue
         standard_errors[rows] = np.sqrt(variance)
-    return coefficients, standard_errors, residual
+    count = max(int(np.isfinite(residual).sum()), 1)
+    return coefficients, standard_errors, residual, total_covariance / count

@@ -15,9 +15,9 @@ from faintspot.slopes.recorded.report import pictures
 from faintspot.slopes.recorded.report.run import SlopesRun
 from faintspot.slopes.recorded.statistics import MeasuredSlopes, SlopesSummary, median, slope_error
 from faintspot.slopes.sensor.layout import Layout
-from faintspot.slopes.wavefront import fit_wavefront
+from faintspot.slopes.wavefront import certify, fit_wavefront
 from faintspot.slopes.wavefront.figure import wavefront_figure
-from faintspot.slopes.wavefront.files import remarks, rms_table
+from faintspot.slopes.wavefront.files import certificate_table, remarks
 
 _TEXT = Texts("faintspot.slopes.recorded")
 _MOST_LISTED = 20
@@ -199,5 +199,5 @@ def _wavefront(run: SlopesRun) -> list[Section]:
             continue
         text += [line for line in remarks(wavefront) if line not in text]
         figure = wavefront_figure(wavefront, run.layout, name, file=f"wavefront-{number + 1}")
-        parts += [Table(*rms_table(wavefront), name), figure]
+        parts += [Table(*certificate_table(certify(wavefront), wavefront.unit), name), figure]
     return [Section("wavefront", "Wavefront", [*text, *parts], " ".join(missing))]
