@@ -26,7 +26,7 @@ Floats = NDArray[np.float64]
 
 MODES, PIXELS, READ_NOISE_E, FWHM_PX, POINTS = 14, 12, 2.0, 2.5, 201
 REFERENCE_FRAMES, SEED = 3, 27
-OF_SLOPES, OF_FRAMES, DRAWS = 150, 60, 2000
+OF_SLOPES, OF_FRAMES, DRAWS = 400, 60, 2000
 """Wavefronts of a case, and draws of a certificate (a fifth of the usual number)."""
 SIZES_PX = 0.0, 0.005, 0.02, 0.08, 0.3
 """Rms of the slopes of a wavefront, one after the other."""
