@@ -11,7 +11,6 @@ import numpy as np
 
 from faintspot.base.errors import InputError
 from faintspot.base.files import derived
-from faintspot.base.report.plots import METHOD_COLOURS, Line, Panel, plot
 from faintspot.cli.shared.commands import SectionedCommand, declared, errors_of_options, option
 from faintspot.cli.shared.needs import can_make
 from faintspot.cli.shared.output import picture_file, write_picture
@@ -21,8 +20,6 @@ from faintspot.slopes.pipeline.slopes import Slopes
 from faintspot.slopes.recorded.stored_run import StoredRun, difference, open_run
 from faintspot.slopes.sensor.layout import OPTICS, Layout
 from faintspot.slopes.wavefront import Wavefront, certify, fit_drift, fit_wavefront, save_wavefront
-from faintspot.slopes.wavefront.drift import drift_figure
-from faintspot.slopes.wavefront.figure import wavefront_map
 from faintspot.slopes.wavefront.files import (
     certificate_table,
     check_wavefront_file,
@@ -133,7 +130,7 @@ def command(
         save_wavefront(output, wavefront, found, over_time or None)
         click.echo(output)
     if drawing is not None:
-        from faintspot.slopes.wavefront.figure import wavefront_figure
+        from faintspot.slopes.wavefront.figure import drift_figure, wavefront_figure
 
         title = Path(slopes).name + ("" if minus is None else f" minus {Path(minus).name}")
         write_picture(wavefront_figure(wavefront, layout, title).figure, drawing)
@@ -210,15 +207,15 @@ def flattening_figure(flat: Flattening, before: Wavefront, after: Wavefront, lay
         Fits to the slopes, and to the slopes with those of the command.
     layout : Layout
     """
+    from faintspot.base.report.plots import METHOD_COLOURS, Line, Panel, plot
+    from faintspot.slopes.wavefront.figure import wavefront_map
+
     largest = float(np.nanmax(np.abs(before.sheet())))
     cases = {"measured": before, "with the command": after}
     maps = [wavefront_map(wavefront, layout, when, largest=largest) for when, wavefront in cases.items()]
     style = {"color": METHOD_COLOURS[1], "drawstyle": "steps-mid", "marker": ".", "lw": 1}
     limits = [] if flat.stroke is None else [-flat.stroke, flat.stroke]
     levels = {0.0: {}, **{limit: {"ls": "--", "label": "stroke limit"} for limit in limits}}
-    line, unit = (
-        Line("command", np.arange(len(flat.command)), flat.command, style=style),
-        "interaction matrix",
-    )
-    panel = Panel([line], "actuator", f"command (unit of the {unit})", levels=levels, share=2)
+    line = Line("command", np.arange(len(flat.command)), flat.command, style=style)
+    panel = Panel([line], "actuator", "command (unit of the interaction matrix)", levels=levels, share=2)
     return plot([maps, [panel]], 9.6, heading="Command that would flatten the mean wavefront")

@@ -75,7 +75,7 @@ REFUSED: list[tuple[Any, Any, str]] = [
     ({"noise_std": 10**400}, None, "noise_std"),
     ({"tolerance": 0.5, "noise_std": "much"}, None, "noise_std"),
     ({"keep_brightest": 64}, None, "keep_brightest"),
-    ({"estimator": "ml"}, None, "psf"),
+    ({"estimator": "ml"}, None, "read_noise_e"),
     ({"estimator": "none such"}, None, "estimator"),
     ({"noise_std": [1.0, 2.0]}, None, "noise_std"),
     ({"threshold_e": [1.0, 2.0]}, None, "threshold_e"),  # not in use now, but it would stay

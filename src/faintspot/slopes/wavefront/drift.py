@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,11 +10,7 @@ from scipy.stats import t as student
 
 from faintspot.base.checks import number_between
 from faintspot.base.errors import InputError
-from faintspot.base.report.plots import METHOD_COLOURS, Line, Panel, plot
 from faintspot.slopes.wavefront.fit import Wavefront
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 Floats = NDArray[np.float64]
 
@@ -95,19 +90,3 @@ def fit_drift(wavefront: Wavefront, bins: int, *, frame_rate_hz: float | None = 
     rate_error = np.sqrt(np.sum(residual**2, axis=0) / (bins - 2) / (since @ since))
     half_width = student.ppf(0.975, bins - 2) * rate_error
     return Drift(time, mean, error, rate, rate_error, half_width, unit)
-
-
-def drift_figure(found: Drift, wavefront: Wavefront, name: str) -> Figure:
-    """Draw each mode's change against time with the fitted line, four modes in a panel."""
-    since, panels = found.time - found.time.mean(), []
-    change = found.mean - found.mean.mean(axis=0)
-    for start in range(0, len(wavefront.modes), len(METHOD_COLOURS)):
-        lines = []
-        for number, colour in zip(range(start, len(wavefront.modes)), METHOD_COLOURS, strict=False):
-            point = {"ls": "", "marker": "o", "ms": 4, "color": colour, "capsize": 2}
-            errors, label = found.standard_error[:, number], f"Z{wavefront.modes[number]}"
-            lines.append(Line(label, found.time, change[:, number], errors, point))
-            lines.append(Line("", found.time, found.rate[number] * since, style={"color": colour, "lw": 1}))
-        panels.append(Panel(lines, f"time ({found.time_unit})", f"change ({wavefront.unit})", legend=True))
-    rows = [panels[start : start + 2] for start in range(0, len(panels), 2)]
-    return plot(rows, 0.6 + 2.8 * len(rows), heading=f"Drift of {name}", legend="")

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from faintspot.base.report.page import FigureWithData
-from faintspot.base.report.plots import GREY, METHOD_COLOURS, Drawing, Line, Panel, Picture
+from faintspot.base.report.plots import GREY, METHOD_COLOURS, Drawing, Line, Panel, Picture, plot
 from faintspot.slopes.sensor.drawing import Outlines
 from faintspot.slopes.sensor.layout import Layout
 from faintspot.slopes.sensor.pupil import lenslet_outlines
+from faintspot.slopes.wavefront.drift import Drift
 from faintspot.slopes.wavefront.fit import Wavefront
 from faintspot.slopes.wavefront.zernike import mode_name, osa_index
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 _MOST_OUTLINED = 1500
 _MOST_NAMED = 45  # modes of a panel
@@ -87,3 +91,19 @@ def _coefficients(wavefront: Wavefront, part: slice, several: bool, share: float
     names = {float(j): f"{mode_name(j)}   Z{j} | {osa_index(j)}" for j in named}
     unit, ends = f"coefficient ({wavefront.unit})", (modes[0] - 0.7, modes[-1] + 0.7)
     return Panel(lines, "", unit, x_range=ends, levels={0.0: {}}, names=names, share=share)
+
+
+def drift_figure(found: Drift, wavefront: Wavefront, name: str) -> Figure:
+    """Draw each mode's change against time with the fitted line, four modes in a panel."""
+    since, panels = found.time - found.time.mean(), []
+    change = found.mean - found.mean.mean(axis=0)
+    for start in range(0, len(wavefront.modes), len(METHOD_COLOURS)):
+        lines = []
+        for number, colour in zip(range(start, len(wavefront.modes)), METHOD_COLOURS, strict=False):
+            point = {"ls": "", "marker": "o", "ms": 4, "color": colour, "capsize": 2}
+            errors, label = found.standard_error[:, number], f"Z{wavefront.modes[number]}"
+            lines.append(Line(label, found.time, change[:, number], errors, point))
+            lines.append(Line("", found.time, found.rate[number] * since, style={"color": colour, "lw": 1}))
+        panels.append(Panel(lines, f"time ({found.time_unit})", f"change ({wavefront.unit})", legend=True))
+    rows = [panels[start : start + 2] for start in range(0, len(panels), 2)]
+    return plot(rows, 0.6 + 2.8 * len(rows), heading=f"Drift of {name}", legend="")
