@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.base.report.plots import Line, Panel, plot
 from faintspot.base.report.texts import Texts, plain_number, with_error
 from faintspot.base.statistics import Estimate
 from faintspot.experiments.methods import Knowledge
@@ -20,6 +19,7 @@ from faintspot.slopes.estimators.built_in.total_variation import TotalVariation
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+    from faintspot.base.report.plots import Line
     from faintspot.experiments.planner.answer import Answer, MethodResult
 
 
@@ -175,6 +175,8 @@ def tune_figure(answer: Answer) -> Figure:
     >>> from faintspot.experiments import tune_figure
     >>> figure = tune_figure(answer)  # of faintspot.tune  # doctest: +SKIP
     """
+    from faintspot.base.report.plots import Line, Panel, plot  # needs matplotlib
+
     magnitudes, question = answer.magnitudes(answer.flux_e), answer.question
     budget, limit = question.budget_px, answer.best.limiting_flux_e
     saturated = question.spots.search_range_px / 2
@@ -215,6 +217,8 @@ def tune_figure(answer: Answer) -> Figure:
 
 
 def _line(answer: Answer, result: MethodResult, magnitudes: NDArray[np.float64]) -> Line:
+    from faintspot.base.report.plots import Line
+
     style, best = result.method.estimator.style, result is answer.best
     drawn = {"color": style.colour, "ls": style.line, "marker": style.marker, "elinewidth": 1}
     drawn |= {"ms": 7, "lw": 3, "zorder": 4} if best else {"ms": 5, "lw": 1.6, "zorder": 3}
