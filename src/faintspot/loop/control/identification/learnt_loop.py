@@ -83,7 +83,7 @@ def learn_winds_again(recording: Recording, like: LoopOfControl) -> tuple[LoopOf
 
 def learn_observed(observed: ObservedLoop, start: Identified | None = None) -> tuple[LoopOfControl, Kalman]:
     """Learn as `learn` from a recording whose delay and open-loop slopes are known."""
-    described, learnt = _with_winds(observed, start)
+    (described, learnt), recorded = _with_winds(observed, start), observed
     if not learnt.is_local:
         observed, described, learnt = _corrected(observed, described, learnt, start)
     ready, seen, modes = observed.ready, observed.seen, LoopInModes.of(observed.ready, observed.delay)
@@ -94,7 +94,7 @@ def learn_observed(observed: ObservedLoop, start: Identified | None = None) -> t
         description = f"{learnt.description}, modes alone leave {share:.2f} of what winds leave"
         learnt = replace(learnt, description=description)
     described = replace(_with_found_winds(described, learnt), law=modes.described.law)
-    return _controlling(described, ready, seen, learnt)
+    return _controlling(described, ready, seen, learnt, is_proven=observed is recorded)
 
 
 def _with_found_winds(described: LoopOfControl, learnt: Kalman) -> LoopOfControl:
@@ -174,12 +174,15 @@ def _in_modes(ready: Prepared, modes: LoopInModes) -> tuple[LoopOfControl, Kalma
 
 
 def _controlling(
-    described: LoopOfControl, ready: Prepared, seen: OpenLoop, learnt: Kalman
+    described: LoopOfControl, ready: Prepared, seen: OpenLoop, learnt: Kalman, *, is_proven: bool = True
 ) -> tuple[LoopOfControl, Kalman]:
-    """Return the control of a learnt filter, with its fallback and stroke limit."""
+    """Return the control of a learnt filter, with its fallback and stroke limit.
+
+    The fallback's gain is raised only with the matrix with which the loop has run (`is_proven`).
+    """
     loop, plant, gain = ready.recording, described.plant(), float(described.delay[2])
     advised = _advised_gain(learnt.plain_gain, gain, float(described.delay[3]), plant.delay_frames)
-    if described.analysis.size:  # whose centroid gain is less certain: a loop that has run is stable
+    if described.analysis.size or not is_proven:  # a loop that has run is stable
         advised = min(advised, ready.loop_gain)
     recorded, remarks = ready.loop_gain, list(loop.remarks)
     plain = recorded if math.isfinite(recorded) else advised

@@ -202,11 +202,16 @@ def misregistration(
     run, frames = runs_of(loop.frame), max(1, round(delay.delay_frames))
     rows = np.flatnonzero(run == np.bincount(run).argmax())[-_MOST_FRAMES - frames :]
     slopes = loop.slopes[rows] / delay.gains(len(loop.cells))
-    return change_of_mirror(slopes, loop.commands[rows], matrix, predictor, frames)
+    return change_of_mirror(slopes, loop.commands[rows], matrix, predictor, frames, delay.misfit)
 
 
 def change_of_mirror(
-    slopes: Floats, commands: Floats, matrix: MovableMatrix, predictor: SlopePredictor, delay: int
+    slopes: Floats,
+    commands: Floats,
+    matrix: MovableMatrix,
+    predictor: SlopePredictor,
+    delay: int,
+    misfit: float = 1.0,
 ) -> Misregistration:
     """Measure the change of a mirror from consecutive frames of a closed loop.
 
@@ -220,6 +225,8 @@ def change_of_mirror(
     predictor : SlopePredictor
     delay : int
         Frames.
+    misfit : float
+        Factor on the errors of the model, where spectra are unlike those of turbulence.
     """
     acting = commands[:-delay] - commands[:-delay].mean(axis=0)
     measured = np.isfinite(slopes)
@@ -243,8 +250,9 @@ def change_of_mirror(
         if update > 0:
             gains[commanded] *= 1 + change[5:] - change[5:].mean()
     gain_error = np.full(len(gains), np.inf)
-    gain_error[commanded] = np.hypot(scale * error[5:], _COLUMN_ERROR)
-    return Misregistration(moved, np.hypot(scale * error[1:5], _MODEL_ERRORS), gains, gain_error)
+    gain_error[commanded] = np.hypot(scale * error[5:], misfit * _COLUMN_ERROR)
+    of_model = misfit * _MODEL_ERRORS
+    return Misregistration(moved, np.hypot(scale * error[1:5], of_model), gains, gain_error)
 
 
 def _whitened(predictor: SlopePredictor, slopes: Floats, signals: list[Floats]) -> tuple[Floats, float]:
