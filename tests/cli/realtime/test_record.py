@@ -31,7 +31,8 @@ pytestmark = [
 def engine() -> Iterator[Engine]:
     """Writes frames."""
     name = f"faintspot-test-{secrets.token_hex(6)}"
-    with Engine(TelemetryRing.create(name, LAYOUT, settings=SETTINGS)) as running:
+    ring = TelemetryRing.create(name, LAYOUT, settings=SETTINGS, image_slots=256)  # none is overwritten
+    with Engine(ring) as running:
         yield running
 
 
