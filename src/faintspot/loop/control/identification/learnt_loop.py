@@ -93,8 +93,10 @@ def learn_observed(observed: ObservedLoop, start: Identified | None = None) -> t
             return _in_modes(ready, modes)
         description = f"{learnt.description}, modes alone leave {share:.2f} of what winds leave"
         learnt = replace(learnt, description=description)
-    described = replace(_with_found_winds(described, learnt), law=modes.described.law)
-    return _controlling(described, ready, seen, learnt, is_proven=observed is recorded)
+    is_proven = observed is recorded
+    ran = modes if is_proven else LoopInModes.of(recorded.ready, recorded.delay)
+    described = replace(_with_found_winds(described, learnt), law=ran.described.law)
+    return _controlling(described, ready, seen, learnt, is_proven=is_proven)
 
 
 def _with_found_winds(described: LoopOfControl, learnt: Kalman) -> LoopOfControl:

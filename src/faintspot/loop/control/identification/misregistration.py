@@ -83,7 +83,7 @@ class Misregistration:
     def measured(self) -> list[Measured]:
         """Return shifts, rotation and magnification with their errors."""
         names = "mirror moved along x", "mirror moved along y", "mirror turned", "mirror magnified"
-        units, factors = ("sub-apertures", "sub-apertures", "degrees", "%"), (1, 1, math.degrees(1), 100)
+        units, factors = ("pitches", "pitches", "degrees", "%"), (1, 1, math.degrees(1), 100)
         return [
             Measured(name, unit, float(factor * value), float(factor * error))
             for name, unit, factor, value, error in zip(
