@@ -231,7 +231,7 @@ def change_of_mirror(
     acting = commands[:-delay] - commands[:-delay].mean(axis=0)
     measured = np.isfinite(slopes)
     known = np.asarray(measured.any(axis=0))
-    residual = np.zeros((len(acting), len(known)))
+    residual = np.zeros((len(acting), len(known)))  # slopes never measured: as if the mirror corrected all
     residual[:, known] = interpolated(slopes[:, known], measured[:, known])[delay:]
     residual -= residual.mean(axis=0)
     moved, gains = np.zeros(4), np.ones(acting.shape[1])

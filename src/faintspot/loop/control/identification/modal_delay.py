@@ -63,7 +63,7 @@ class ModalFits:
     Raises
     ------
     InputError
-        When there are fewer than 8 pieces of 128 consecutive frames, half overlapping.
+        When there are fewer than 4 pieces of 128 consecutive frames, half overlapping.
     """
 
     def __init__(self, modes: Floats, sent: Floats, run: NDArray[np.int64]) -> None:

@@ -17,11 +17,7 @@ from faintspot.base.files import read_arrays, save_arrays
 from faintspot.loop.control.base import SETTLE_FRAMES, CommandDelayLine
 from faintspot.loop.control.identification.controlled_loop import LoopOfControl
 from faintspot.loop.control.identification.layers import Identified
-from faintspot.loop.control.identification.learning import (
-    JUDGED_PART,
-    STANDARD_ERRORS,
-    error_of_mean,
-)
+from faintspot.loop.control.identification.learning import JUDGED_PART, STANDARD_ERRORS, error_of_mean
 from faintspot.loop.control.identification.learnt_loop import (
     ObservedLoop,
     learn_loop,
@@ -31,11 +27,7 @@ from faintspot.loop.control.identification.learnt_loop import (
 from faintspot.loop.control.identification.loop_delay import LoopDelay
 from faintspot.loop.control.identification.modal_loop import LEAST_MEASURED
 from faintspot.loop.control.identification.model import Kalman, state_space, write_matrices
-from faintspot.loop.control.identification.open_loop import (
-    Measured,
-    Wind,
-    open_loop_of,
-)
+from faintspot.loop.control.identification.open_loop import Measured, Wind, open_loop_of
 from faintspot.loop.control.identification.recording import Recording
 from faintspot.loop.control.identification.relearning import (
     FRAMES,
@@ -51,7 +43,7 @@ Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]
 
 _MEASURED_FRAMES = 60  # that the integrator drives the mirror first, so that its residual is measured
-_EASED_FRAMES = 100  # in which it gets there
+_EASED_FRAMES = 100  # in which the fallback's gain goes from the recorded one to its own
 _ABSURD = 1e3  # of the rms of recorded slopes: no such slope is measured
 _CONTENTS = "a predictive controller"
 _RELEARNT_FROM = 750  # frames since the integrator took over, from which is learnt in the background
@@ -197,7 +189,9 @@ class PredictiveControl:
             self._controller.set_plain_gain(loop.recorded_gain ** (1 - part) * plain**part)
         self._controller.update(*self._controlled(scaled, errors))
         command = loop.sign * self._line.latest
-        self._recent.add(np.where(np.isfinite(errors), scaled, np.nan) / loop.scale, command)
+        if errors is not loop.standard_error:  # else only what is never measured is missing
+            scaled = np.where(np.isfinite(errors), scaled, np.nan)
+        self._recent.add(scaled, command)
         return command
 
     def _controlled(self, slopes: Floats, errors: Floats) -> tuple[Floats, Floats]:
@@ -227,8 +221,15 @@ class PredictiveControl:
             return
         frames = self._since_loss or self._waited
         if self._since_loss >= _RELEARNT_FROM or self._waited >= _RELEARNT_EVERY:
-            task = partial(_write_task, self._loop, self.model, *self._recent.latest(frames))
+            task = partial(_write_task, self._loop, self.model, *self._latest(frames))
             self._beside = BesideTheLoop(_LEARN_BESIDE, task, _read_result)
+
+    def _latest(self, frames: int) -> tuple[Singles, Singles]:
+        """Return slopes and commands of the latest frames, in the user's units; NaN where not measured."""
+        loop = self._loop
+        slopes, commands = self._recent.latest(frames)
+        scale: Singles = np.where(np.isfinite(loop.standard_error), loop.scale, np.nan).astype(np.float32)
+        return np.divide(slopes, scale, dtype=np.float32), commands
 
     def recording_of(self, slopes: ArrayLike, commands: ArrayLike) -> Recording:
         """Return frames of this controller's loop, (frames, m) and (frames, commands), as a recording.
@@ -329,7 +330,7 @@ class PredictiveControl:
             As `learn`; then nothing changes.
         """
         if recording is None:
-            better, self.relearnt = self.better_of(self.recording_of(*self._recent.latest(FRAMES)))
+            better, self.relearnt = self.better_of(self.recording_of(*self._latest(FRAMES)))
             if better is not None:
                 self._take(better)
             return self

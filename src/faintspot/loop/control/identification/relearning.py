@@ -52,7 +52,7 @@ class RecentFrames:
         return self._count
 
     def add(self, slopes: Floats, command: Floats) -> None:
-        """Add a frame; slopes that were not measured are NaN."""
+        """Add a frame; NaN where a slope was not measured in it."""
         self._slopes[self._next], self._commands[self._next] = slopes, command
         self._next = (self._next + 1) % len(self._slopes)
         self._count = min(self._count + 1, len(self._slopes))
