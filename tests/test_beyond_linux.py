@@ -14,7 +14,7 @@ from tests.cli.cli_cases import CONFIGURATION, Commands, assert_equal, expected,
 
 import faintspot as fs
 from faintspot import InputError
-from faintspot.base import extras
+from faintspot.base import errors
 from faintspot.cli.realtime import command as realtime
 
 SCRIPT = Path(__file__).with_name("beyond_linux.py")
@@ -120,6 +120,6 @@ def test_the_other_ways_into_real_time_say_so_too(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     run = Commands(capsys)
-    monkeypatch.setattr(extras, "SHARED_MEMORY", tmp_path / "none")
+    monkeypatch.setattr(errors, "SHARED_MEMORY", tmp_path / "none")
     for line in ("live", "realtime demo", "telemetry --engine faintspot"):
         run.refused(*line.split(), naming=("needs shared memory", "which Linux has"))

@@ -59,7 +59,7 @@ def test_import_is_light() -> None:
 def test_sensor_needs_no_kernels() -> None:
     """Neither the sensor nor the declaration of options; settings have an estimator, which has a kernel."""
     statement = (
-        "import faintspot, faintspot.base.config.options, faintspot.base.config.tables\n"
+        "import faintspot, faintspot.base.options, faintspot.base.tables\n"
         "faintspot.Layout.grid((2, 2), pixels=4)\nfaintspot.Calibration()"
     )
     assert imported_by(statement) <= {"scipy"}

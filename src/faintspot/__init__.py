@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from faintspot.base.extras import lazy_attributes
-from faintspot.base.version import __version__ as __version__
+from faintspot.base import __version__ as __version__
+from faintspot.base.errors import lazy_attributes
 
 if TYPE_CHECKING:
     from faintspot import adapters as adapters

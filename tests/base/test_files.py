@@ -1,12 +1,24 @@
+"""Files: what is written and read, and absurd sizes refused in one line before they take memory or time."""
+
 import errno
 import os
+from collections.abc import Callable
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
+import numpy as np
 import pytest
+from tests.refusals import refused
 
+import faintspot as fs
 from faintspot.base import files
 from faintspot.base.errors import InputError
+from faintspot.base.files import MOST_NUMBERS, check_size
+from faintspot.experiments.study.specification import StudySpecification
+from faintspot.experiments.study.sweep import Sweep
+from faintspot.io import open_frames
+from faintspot.loop.simulation.configuration.configuration import LoopConfiguration
+from faintspot.slopes.spots.psf import PSF
 
 
 @pytest.mark.parametrize("content", [b"\xc3\xa9\n", "é\n", lambda stream: stream.write(b"\xc3\xa9\n")])
@@ -121,3 +133,124 @@ class TestThatFail:
         else:
             with pytest.raises(OSError, match="error"):
                 files.sync_folder(tmp_path)
+
+
+GRID = "[layout.grid]\nshape = [3, 3]\npixels = 8\n"
+SETTINGS = '[estimator]\nname = "centroid"\n'
+
+
+def of_text(text: str) -> Callable[[Path], Any]:
+    def read(folder: Path) -> Any:
+        path = folder / "faintspot.toml"
+        path.write_text(text)
+        return fs.SlopePipeline.from_file(path)
+
+    return read
+
+
+def with_cells(cells: Any) -> fs.Layout:
+    return fs.Layout((64, 64), (8, 8), np.array([[0, 0], [9, 9]]), cells=cells)
+
+
+def map_of(pixels: int, size: float, **options: Any) -> fs.SlopePipeline:
+    layout = fs.Layout.grid((4, 4), pixels=pixels)
+    psf = PSF.analytic("gaussian", size=size, radius_px=8)
+    return fs.SlopePipeline(layout, fs.Settings("map", **options), fs.Calibration(read_noise_e=1.0), psf=psf)
+
+
+def spread(points: int) -> Any:
+    return np.linspace(1, 100, points).tolist()
+
+
+CASES: dict[str, tuple[Callable[[Path], Any], tuple[str, ...]]] = {
+    "frame": (
+        of_text("[layout]\nframe_shape = [1000000000, 1000000000]\nwindow = 8\ncorners = [[0, 0]]\n"),
+        ("layout.frame_shape = 1000000000 x 1000000000", "268,435,456 pixels"),
+    ),
+    "grid": (of_text("[layout.grid]\nshape = [10000, 10000]\npixels = 16\n"), ("layout.grid.shape",)),
+    "pitch": (lambda _: fs.Layout.grid((3, 3), pixels=8, pitch=10_000), ("frame_shape",)),
+    "cells": (lambda _: with_cells([[0, 0], [1e300, 0]]), ("layout.cells = 1e+300",)),
+    "map of cells": (lambda _: with_cells([[0, 0], [9999, 9999]]), ("layout.cells = 10000 x 10000",)),
+    "read noise": (
+        of_text(f"{GRID}{SETTINGS}[calibration]\nread_noise_e = 1e200\n"),
+        ("read_noise_e = 1e+200",),
+    ),
+    "gain": (of_text(f"{GRID}{SETTINGS}[calibration]\nem_gain = 1e-300\n"), ("em_gain = 1e-300",)),
+    "bad pixel": (
+        of_text(f"{GRID}{SETTINGS}[calibration]\nbad_pixels = [[1e300, 0]]\n"),
+        ("bad_pixels = 1e+300",),
+    ),
+    "auto and a number": (
+        of_text(f'{GRID}[estimator]\nname = "tv"\nnoise_std = {{ default = "auto", 3 = 2.0 }}\n'),
+        ('noise_std: expected "auto" for the whole sensor or numbers for all',),
+    ),
+    "auto in a list": (
+        of_text(f'{GRID}[estimator]\nname = "tv"\nnoise_std = ["auto", 2.0]\n'),
+        ('noise_std: expected "auto" for the whole sensor or numbers for all',),
+    ),
+    "posterior of many fluxes": (
+        lambda _: map_of(64, 0.5, flux_e=np.linspace(10, 1000, 16)),
+        ("map: tables of the posterior", "search_range_px", "one flux_e"),
+    ),
+    "posterior of any flux": (lambda _: map_of(64, 0.3), ("map: tables of the posterior",)),
+    "psf's radius": (lambda _: PSF.analytic(radius_px=256), ("radius_px = 256",)),
+    "psfs": (lambda _: PSF.analytic(size=np.ones(99), radius_px=128, index=range(99)), ("psf.samples",)),
+    "psf's side": (lambda _: PSF(np.ones((5, 5001)), 8), ("psf.samples: expected at most 4097",)),
+    "image": (lambda _: PSF.analytic().images([[0, 0]], (1 << 20, 1 << 20)), ("shape = 1048576 x",)),
+    "spot": (lambda _: fs.slopes.simulate.spots([[0, 0]], shape=(1 << 20, 1 << 20)), ("shape = 1048576 x",)),
+    "loop": (
+        lambda _: LoopConfiguration().replace("sensor", subapertures=200, samples=128),
+        ("subapertures x samples",),
+    ),
+    "study": (
+        lambda _: StudySpecification(
+            "s", [Sweep("s", flux_e=spread(1000), read_noise_e=spread(1000), background_e=spread(1000))]
+        ),
+        ("sweeps", "100,000 cells"),
+    ),
+}
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_it_is_refused_in_one_line(name: str, tmp_path: Path) -> None:
+    make, words = CASES[name]
+    with refused(*words):
+        make(tmp_path)
+
+
+def test_large_grids_are_quick_enough_to_make() -> None:
+    assert len(fs.Layout.grid((300, 300), pixels=8)) == 90_000
+
+
+def test_flux_beyond_the_memory_uses_the_nearest_tables(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Faint and bright frames in turn: with room for few levels, all are measured, the first ones alike."""
+    from faintspot.slopes.estimators.built_in import maximum_likelihood
+
+    rng = np.random.default_rng(1)
+    roomy, narrow = map_of(8, 0.8), map_of(8, 0.8)
+    place = fs.slopes.simulate.spots(np.zeros((16, 2)), shape=(8, 8), size=0.8, profile="gaussian")
+    bright = place.reshape(4, 4, 8, 8).swapaxes(1, 2).reshape(32, 32)
+    frames = rng.poisson(np.multiply.outer([30, 300, 330, 3000], bright)) + rng.normal(0, 1, (4, 32, 32))
+    room: Any = narrow.plan.prepared
+    expected = [roomy(frame) for frame in frames]
+    monkeypatch.setattr(maximum_likelihood, "MOST_NUMBERS", 2 * np.prod(room.table_shape))
+    full = [narrow(frame) for frame in frames]
+    assert len(room.tables.logarithms) == 2
+    for place_in_turn in range(2):
+        assert np.array_equal(full[place_in_turn].x, expected[place_in_turn].x)
+    assert all(np.all(np.isfinite(slopes.x)) for slopes in full)
+
+
+def test_sizes_up_to_the_limit_pass() -> None:
+    check_size("frame", (1 << 14, 1 << 14))
+    with pytest.raises(fs.InputError, match="frame = 2 x 268435456: expected at most 268,435,456 numbers"):
+        check_size("frame", (2, MOST_NUMBERS))
+
+
+class TestFilesThatClaimMore:
+    def test_frames_beyond_any_camera(self, tmp_path: Path) -> None:
+        zarr = pytest.importorskip("zarr")
+        path = tmp_path / "frames.zarr"
+        zarr.create_array(str(path), shape=(2, 1 << 17, 1 << 17), chunks=(1, 1 << 14, 1 << 14), dtype="f4")
+        with pytest.raises(fs.InputError, match="its frames = 131072 x 131072"):
+            open_frames([path])

@@ -10,7 +10,7 @@ from tests.cli.cli_cases import CONFIGURATION, Commands, simulated
 from tests.slopes.wavefront.test_fit import slopes_of
 
 from faintspot import Layout
-from faintspot.base.json_text import parse_json, plain_values
+from faintspot.base.text_files import parse_json, plain_values
 from faintspot.cli.wavefront import _with_error_of
 from faintspot.io import read_slopes
 from faintspot.slopes.pipeline.configuration import to_text

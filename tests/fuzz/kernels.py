@@ -28,7 +28,7 @@ from tests.fuzz.guarded import guarded, guarded_tree
 from tests.fuzz.refused import refused_in_one_line
 
 import faintspot as fs
-from faintspot.base.config.tables import PRESETS
+from faintspot.base.tables import PRESETS
 from faintspot.engine.path import frame_path
 from faintspot.engine.path.frame_path import FramePath, Progress
 from faintspot.slopes.estimators import estimators

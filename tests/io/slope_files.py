@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 from tests.refusals import refused
 
-from faintspot.base.variables import VARIABLES
+from faintspot.base.flags import VARIABLES
 from faintspot.io import SlopeWriter, create_writer, read_slopes
 
 pytest.importorskip("astropy")

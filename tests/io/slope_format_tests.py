@@ -27,7 +27,7 @@ from tests.refusals import refused
 
 from faintspot.base import files
 from faintspot.base.errors import InputError
-from faintspot.base.variables import VARIABLES, Variable
+from faintspot.base.flags import VARIABLES, Variable
 from faintspot.io import read_slopes
 from faintspot.io.arrays import zarr_store
 from faintspot.io.slopes import read_reference

@@ -19,7 +19,7 @@ from tests.io.slope_format_tests import SlopeFormatTests, SlopeStoreTests
 from tests.refusals import refused
 
 from faintspot.base.errors import MissingExtraError
-from faintspot.base.variables import VARIABLES
+from faintspot.base.flags import VARIABLES
 from faintspot.io import open_frames, read_slopes
 from faintspot.io.formats import csv_files
 from faintspot.io.stored import slopes_format

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from faintspot.base.checks import finite_array, not_none, number_between, real_array
 from faintspot.base.errors import InputError
-from faintspot.base.toml_files import check_keys
+from faintspot.base.text_files import check_keys
 from faintspot.slopes.camera.calibration import Calibration
 from faintspot.slopes.pipeline.configuration import Configuration
 from faintspot.slopes.pipeline.light import MeanFlux

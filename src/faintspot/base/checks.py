@@ -1,8 +1,4 @@
-"""Input checks: values are validated on entry to every public function and on reading every file.
-
-Each check returns the value in the form that the code uses, or raises an InputError with one line that names
-the value, what it was and what was expected.
-"""
+"""Input checks on entry to every public function and on reading every file; independent random generators."""
 
 from __future__ import annotations
 
@@ -188,3 +184,37 @@ def _range_text(low: float, high: float, low_open: bool) -> str:
     if np.isinf(low):
         return f"a number up to {high:g}"
     return f"a number {start} to {high:g}"
+
+
+def spawn(rng: object, count: int) -> list[np.random.Generator]:
+    """Return `count` independent generators spawned from `rng`.
+
+    With separate generators, switching one source of randomness on or off does not change the draws of the
+    others. Spawning does not advance the caller's stream, but a second call gives different children.
+
+    Parameters
+    ----------
+    rng : numpy.random.Generator or None
+        Parent generator; None uses fresh entropy from the operating system.
+    count : int
+        Number of generators.
+
+    Returns
+    -------
+    list of numpy.random.Generator
+
+    Raises
+    ------
+    InputError
+        If `rng` is neither None nor a generator that can spawn.
+    """
+    if rng is None:
+        rng = np.random.default_rng()
+    if not isinstance(rng, np.random.Generator):
+        raise InputError(f"rng: expected a numpy.random.Generator or None, got {type(rng).__name__}")
+    try:
+        return rng.spawn(count)
+    except TypeError:
+        raise InputError(
+            "rng: expected a generator that can spawn, such as numpy.random.default_rng(seed)"
+        ) from None

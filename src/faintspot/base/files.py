@@ -1,4 +1,4 @@
-"""Files: written atomically, never left incomplete; .npz files read with checks; objects that are closed."""
+"""Files: size limits, atomic writes that leave nothing incomplete, checked .npz files, objects that close."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import contextlib
 import csv
 import errno
 import io
+import math
 import os
 import secrets
 import stat
@@ -18,7 +19,59 @@ from typing import Any, BinaryIO, ClassVar, Self
 import numpy as np
 
 from faintspot.base.errors import InputError, errors_within
-from faintspot.base.sizes import check_bytes
+
+MOST_NUMBERS = 1 << 28
+"""Maximum number of values, 1 GB in float32: a frame of 16,384 x 16,384 pixels."""
+
+
+MOST_TEXT_BYTES = 1 << 26
+"""Maximum size of metadata (JSON text)."""
+
+
+def check_size(
+    name: str, sides: Sequence[int], most: int = MOST_NUMBERS, what: str = "", hint: str = ""
+) -> None:
+    """Raise an error for an array of more than `most` numbers.
+
+    Parameters
+    ----------
+    name : str
+        Name in messages.
+    sides : sequence of int
+        Shape of the array, or counts to multiply.
+    most : int
+    what : str
+        Unit of the count, such as "pixels".
+    hint : str
+        Advice on what to change.
+
+    Raises
+    ------
+    InputError
+        If it is larger.
+    """
+    if math.prod(sides) > most:
+        name = f"{name} = {' x '.join(map(str, sides))}"
+        raise InputError(f"expected at most {most:,} {what or 'numbers'}{hint and f'; {hint}'}", name=name)
+
+
+def check_bytes(name: object, total: int, most: int, what: str) -> None:
+    """Raise an error if `what`, read from a file, needs more than `most` bytes of memory.
+
+    Raises
+    ------
+    InputError
+        If it does.
+    """
+    if total > most:
+        size, limit = f"{total / 2**20:,.0f} MiB", f"{most / 2**20:,.0f} MiB"
+        raise InputError(f"{name}: needs {size} of memory, expected {what} of at most {limit}")
+
+
+def memory_bytes() -> int:
+    """Return the memory of the machine in bytes."""
+    return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+
 
 _ADVICE = {
     errno.ENOSPC: "the disk is full: free some space and run again; completed results are kept",

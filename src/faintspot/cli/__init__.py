@@ -12,8 +12,8 @@ from pathlib import Path
 
 import click
 
+from faintspot.base import __version__
 from faintspot.base.errors import InputError, MissingExtraError
-from faintspot.base.version import __version__
 
 _COMMANDS = {
     "demo": "Simulate a faint star, measure it with and without denoising, and write a report.",

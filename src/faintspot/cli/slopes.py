@@ -8,9 +8,9 @@ from typing import Any
 
 import click
 
-from faintspot.base.config.tables import parse_changes
 from faintspot.base.errors import InputError, MissingExtraError
 from faintspot.base.flags import SubapertureFlag
+from faintspot.base.tables import parse_changes
 from faintspot.cli.shared.commands import KEY, NAMES, REFERENCE, configuration_option, option
 from faintspot.cli.shared.progress import progress_bar
 from faintspot.io.formats.registry import slope_format

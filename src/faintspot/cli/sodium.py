@@ -8,9 +8,9 @@ from pathlib import Path
 import click
 import numpy as np
 
-from faintspot.base.config.tables import save_tables
 from faintspot.base.errors import InputError
 from faintspot.base.files import derived
+from faintspot.base.tables import save_tables
 from faintspot.cli.shared.commands import KEY, configuration_option, option
 from faintspot.cli.shared.output import picture_file, write_picture
 from faintspot.cli.shared.progress import progress_bar

@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from faintspot.base.errors import InputError
-from faintspot.base.extras import require
+from faintspot.base.errors import InputError, require
 from faintspot.base.files import derived, write_atomically
 from faintspot.cli.shared.commands import option
 from faintspot.cli.shared.needs import needs

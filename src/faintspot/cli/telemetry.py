@@ -11,10 +11,9 @@ from typing import TYPE_CHECKING
 import click
 
 from faintspot.base.checks import not_none
-from faintspot.base.errors import InputError, errors_within
-from faintspot.base.extras import require, require_linux
+from faintspot.base.errors import InputError, errors_within, require, require_linux
 from faintspot.base.files import derived, write_atomically
-from faintspot.base.json_text import to_json
+from faintspot.base.text_files import to_json
 from faintspot.cli.shared.commands import SectionedCommand, declared, option
 from faintspot.cli.shared.needs import needs
 from faintspot.cli.shared.progress import progress_bar

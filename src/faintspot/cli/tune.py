@@ -13,8 +13,8 @@ import click
 import numpy as np
 from rich.console import Console
 
-from faintspot.base.config.tables import save_tables
 from faintspot.base.errors import InputError
+from faintspot.base.tables import save_tables
 from faintspot.cli.shared.commands import SectionedCommand, declared, flag_of, option, which_frames
 from faintspot.cli.shared.needs import suggested_slopes
 from faintspot.cli.shared.output import check_target, picture_file, results_table, wrapped, write_picture

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from faintspot.base.checks import not_none, number_between, numbers_between
 from faintspot.base.errors import InputError
 from faintspot.base.files import Closing
-from faintspot.base.toml_files import check_keys
+from faintspot.base.text_files import check_keys
 from faintspot.engine.pixels.pixel_ring import PixelRing
 from faintspot.engine.pixels.readout import CameraReport, Readout, RowTimes, StopEvent, readout_type
 from faintspot.engine.requests.requests import EFFECT_TIMEOUT_S, Handler, changes_of

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from faintspot.base.config.options import AUTO
+from faintspot.base.options import AUTO
 from faintspot.base.statistics import slope_statistics
 from faintspot.loop.simulation.methods import Method
 from faintspot.slopes.estimators.base import Estimator, Need, Style

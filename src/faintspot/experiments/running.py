@@ -22,10 +22,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from faintspot.base import __version__
 from faintspot.base.checks import number_between
-from faintspot.base.errors import InputError
-from faintspot.base.extras import require
-from faintspot.base.version import __version__
+from faintspot.base.errors import InputError, require
 from faintspot.experiments.store import Arrays, UnitStore
 from faintspot.slopes.estimators.registry import estimators, register
 from faintspot.slopes.kernels.parallel import available_cpus

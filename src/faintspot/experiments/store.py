@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from faintspot.base import __version__
 from faintspot.base.errors import InputError
 from faintspot.base.files import output_errors
-from faintspot.base.version import __version__
 from faintspot.io.arrays.zarr_store import stored_attributes
 from faintspot.io.locations import one_line
 from faintspot.io.optional_packages import load_zarr

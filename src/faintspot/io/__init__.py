@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING
 
-from faintspot.base.extras import lazy_attributes
+from faintspot.base.errors import lazy_attributes
 
 if TYPE_CHECKING:
     from faintspot.io.frames import FrameSource as FrameSource

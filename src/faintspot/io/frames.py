@@ -14,8 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.errors import InputError, MissingExtraError
-from faintspot.base.files import Closing
-from faintspot.base.sizes import check_bytes, check_size
+from faintspot.base.files import Closing, check_bytes, check_size
 from faintspot.io.arrays.stored_array import MOST_WHOLE_BYTES, StoredArray, arranged
 from faintspot.io.formats.registry import frame_format
 from faintspot.io.locations import one_line, split_location

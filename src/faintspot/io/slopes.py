@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 from faintspot.base.checks import finite_array, number_between, one_of
 from faintspot.base.errors import InputError, MissingExtraError, errors_within
 from faintspot.base.files import check_regular, output_errors
-from faintspot.base.flags import leave_out
-from faintspot.base.variables import VARIABLES, scaled_positions
+from faintspot.base.flags import VARIABLES, leave_out, scaled_positions
 from faintspot.io.formats.file_format import FileFormat
 from faintspot.io.formats.registry import slope_endings, slope_format
 from faintspot.io.formats.zarr_files import Zarr

@@ -8,7 +8,7 @@
 
 from typing import TYPE_CHECKING
 
-from faintspot.base.extras import lazy_packages
+from faintspot.base.errors import lazy_packages
 
 if TYPE_CHECKING:
     from faintspot.slopes import camera as camera

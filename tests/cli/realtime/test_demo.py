@@ -128,7 +128,7 @@ def test_bad_options_used_names_and_missing_packages_are_refused(
         assert naming in refused.error
     with ControlServer(socket_path(name), {"status": lambda fields: {"counters": {}}}):
         run.refused("realtime", "demo", "--name", name, naming=("expected an unused name",))
-    monkeypatch.setattr("faintspot.base.extras.present", lambda package: package == "zarr")
+    monkeypatch.setattr("faintspot.base.errors.present", lambda package: package == "zarr")
     wanted = "needs pyshmem and tornado and hcipy: install it with pip install 'faintspot[realtime,loop]'"
     run.refused("realtime", "demo", naming=(wanted,))
     assert [path.name for path in folder.iterdir()] == ["faintspot.toml"]

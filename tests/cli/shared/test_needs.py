@@ -11,7 +11,7 @@ import pytest
 from tests.cli.cli_cases import Commands
 from tests.shared_data import ROOT
 
-from faintspot.base.extras import EXTRAS, present, require
+from faintspot.base.errors import EXTRAS, present, require
 from faintspot.cli import group
 
 pytestmark = pytest.mark.slow

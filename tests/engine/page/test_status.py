@@ -32,7 +32,7 @@ def test_values_of_subapertures_are_told_by_their_ends() -> None:
 
 def test_what_an_engine_answers_can_be_set_again() -> None:
     """The form's texts, parsed as `realtime send` parses them, are the settings."""
-    from faintspot.base.config.tables import parse_changes
+    from faintspot.base.tables import parse_changes
 
     settings = fs.Settings(estimator="ml", search_range_px=2.5)
     names = [*settings.estimator.declared(), *SharedOptions.declared()]

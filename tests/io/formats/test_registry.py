@@ -13,7 +13,7 @@ from tests.io.slope_files import assert_refused
 from tests.io.slope_format_tests import SlopeFormatTests
 from tests.refusals import refused
 
-from faintspot.base.variables import VARIABLES
+from faintspot.base.flags import VARIABLES
 from faintspot.io import open_frames
 from faintspot.io.arrays.fits_units import StreamedArray
 from faintspot.io.arrays.stored_array import StoredArray

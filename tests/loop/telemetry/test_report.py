@@ -11,7 +11,7 @@ from tests.loop.control.driven import driven, oscillator
 from tests.loop.telemetry.loop_cases import AIR, LOOP_GAIN, NOISE_PX, RATE_HZ, recorded
 
 from faintspot.base.errors import InputError
-from faintspot.base.json_text import parse_json, to_json
+from faintspot.base.text_files import parse_json, to_json
 from faintspot.loop.control.identification.loop_delay import LoopDelay
 from faintspot.loop.control.identification.open_loop import Measured, open_loop_of
 from faintspot.loop.control.identification.vibrations import Vibration

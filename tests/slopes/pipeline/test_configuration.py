@@ -9,7 +9,7 @@ from hypothesis.extra import numpy as hnp
 from tests.refusals import refused
 
 import faintspot as fs
-from faintspot.base.config.options import PerSubaperture
+from faintspot.base.options import PerSubaperture
 from faintspot.slopes.estimators import Estimator, estimators
 from faintspot.slopes.pipeline import configuration
 

@@ -10,9 +10,9 @@ from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
+from faintspot.base import __version__
 from faintspot.base.errors import MissingExtraError
 from faintspot.base.files import write_atomically
-from faintspot.base.version import __version__
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -14,8 +14,8 @@ import click
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.base.config.tables import save_tables
 from faintspot.base.errors import DoubtWarning, InputError
+from faintspot.base.tables import save_tables
 from faintspot.cli.layout import options as layout_options
 from faintspot.cli.layout.completing import (
     clearer_frame,

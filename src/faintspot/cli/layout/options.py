@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.base.config.tables import Tables, is_map
 from faintspot.base.errors import InputError
+from faintspot.base.tables import Tables, is_map
 from faintspot.slopes.camera.calibration import Calibration, read_map
 from faintspot.slopes.sensor.binning import scaled_points
 from faintspot.slopes.sensor.layout import Layout

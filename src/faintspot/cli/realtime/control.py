@@ -7,10 +7,9 @@ from typing import Any
 
 import click
 
-from faintspot.base.config.tables import parse_changes
 from faintspot.base.errors import InputError
-from faintspot.base.json_text import to_json
-from faintspot.base.toml_files import check_keys
+from faintspot.base.tables import parse_changes
+from faintspot.base.text_files import check_keys, to_json
 from faintspot.cli.shared.commands import ENGINE_NAME, RANGES, option
 from faintspot.cli.shared.engine_requests import (
     asked,

@@ -7,8 +7,7 @@ from pathlib import Path
 
 import click
 
-from faintspot.base.errors import InputError
-from faintspot.base.extras import require_linux
+from faintspot.base.errors import InputError, require_linux
 from faintspot.base.files import derived
 from faintspot.cli.shared.commands import ENGINE_NAME, configuration_option, option
 from faintspot.cli.shared.needs import needs

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from faintspot.base.extras import require, require_linux
+from faintspot.base.errors import require, require_linux
 from faintspot.cli.shared.commands import ENGINE_NAME, PORT, option
 from faintspot.cli.shared.needs import needs
 

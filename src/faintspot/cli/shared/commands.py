@@ -9,9 +9,9 @@ from typing import Any
 
 import click
 
-from faintspot.base.config.options import REQUIRED, TEXT, Options
-from faintspot.base.config.tables import parse_ranges
 from faintspot.base.errors import InputError
+from faintspot.base.options import REQUIRED, TEXT, Options
+from faintspot.base.tables import parse_ranges
 
 _GENERAL = "Options"
 Decorator = Callable[[Callable[..., Any]], Callable[..., Any]]

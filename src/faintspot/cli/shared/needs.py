@@ -9,8 +9,7 @@ from typing import Any
 import click
 
 from faintspot.base.checks import not_none
-from faintspot.base.errors import MissingExtraError
-from faintspot.base.extras import present, require, require_linux
+from faintspot.base.errors import MissingExtraError, present, require, require_linux
 
 
 def needs(extra: str, *packages: str) -> Callable[[click.Command], click.Command]:

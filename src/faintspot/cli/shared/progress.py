@@ -20,7 +20,7 @@ from rich.progress import (
 )
 from rich.text import Text
 
-from faintspot.base.extras import present
+from faintspot.base.errors import present
 from faintspot.cli.shared.commands import option
 
 if TYPE_CHECKING:

@@ -12,8 +12,8 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Protocol
 
-from faintspot.base.config.tables import parse_changes, parse_ranges
 from faintspot.base.errors import InputError
+from faintspot.base.tables import parse_changes, parse_ranges
 from faintspot.engine.requests.requests import LENGTHY_TIMEOUT_S, request, since, socket_path
 from faintspot.engine.telemetry.recorder import Recorder
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from faintspot.base.checks import not_none
 from faintspot.base.errors import InputError
-from faintspot.base.json_text import to_json
+from faintspot.base.text_files import to_json
 from faintspot.engine.page.page_state import BatchSource, PageState, Picture, flag_names
 from faintspot.slopes.sensor.layout import Layout
 from faintspot.slopes.sensor.pupil import lenslet_outlines

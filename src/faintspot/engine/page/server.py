@@ -17,7 +17,7 @@ from importlib.resources import files
 from pathlib import Path
 
 from faintspot.base.errors import InputError, MissingExtraError
-from faintspot.base.json_text import parse_json, to_json
+from faintspot.base.text_files import parse_json, to_json
 from faintspot.engine.page.client_requests import Access, ClientRequests, EngineRequests, answered
 from faintspot.engine.page.engine_source import EngineSource, RecordingSource
 from faintspot.engine.page.page import UPDATE_S, LatestMessages, Page, packed

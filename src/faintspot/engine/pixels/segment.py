@@ -34,7 +34,7 @@ from numpy.typing import NDArray
 
 from faintspot.base.errors import InputError
 from faintspot.base.files import Closing
-from faintspot.base.json_text import parse_json, to_json
+from faintspot.base.text_files import parse_json, to_json
 from faintspot.slopes.kernels.compilation.ordered import load, store
 
 

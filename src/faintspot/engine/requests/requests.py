@@ -23,7 +23,7 @@ from typing import Any
 
 from faintspot.base.errors import InputError
 from faintspot.base.files import Closing
-from faintspot.base.json_text import parse_json, to_json
+from faintspot.base.text_files import parse_json, to_json
 
 _BACKLOG = 64
 _LONGEST_PATH = 107  # bytes; limit for Unix sockets on Linux

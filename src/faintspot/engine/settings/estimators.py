@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from faintspot.base.errors import InputError
-from faintspot.base.json_text import parse_json, to_json
+from faintspot.base.text_files import parse_json, to_json
 from faintspot.engine.path.python_path import call_within, tried
 from faintspot.engine.requests.requests import EFFECT_TIMEOUT_S
 from faintspot.engine.settings.interleaving import EVERY, FIRST_METHOD, METHODS

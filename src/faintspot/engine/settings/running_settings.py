@@ -15,9 +15,9 @@ from typing import Any, Generic, Protocol, TypeVar
 import numpy as np
 
 from faintspot.base.checks import numbers_between
-from faintspot.base.config.options import PerSubaperture
 from faintspot.base.errors import InputError
-from faintspot.base.toml_files import check_known
+from faintspot.base.options import PerSubaperture
+from faintspot.base.text_files import check_known
 from faintspot.slopes.estimators.spots import Stepping
 from faintspot.slopes.pipeline.settings import Settings, check_option, option_names
 from faintspot.slopes.sensor.layout import Layout

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from faintspot.base.checks import number_between
-from faintspot.base.json_text import parse_json, plain_values, to_json
+from faintspot.base.text_files import parse_json, plain_values, to_json
 from faintspot.engine.pixels.segment import CLOSED, Segment
 from faintspot.io.telemetry.recording import item_type
 from faintspot.slopes.kernels.compilation.ordered import fence, load, store

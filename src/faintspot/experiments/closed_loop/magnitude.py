@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.checks import numbers_between
-from faintspot.base.config.tables import save_tables
 from faintspot.base.errors import InputError
 from faintspot.base.files import derived, write_atomically
-from faintspot.base.json_text import parse_json, to_json
+from faintspot.base.tables import save_tables
+from faintspot.base.text_files import parse_json, to_json
 from faintspot.experiments.closed_loop.methods import default_methods, tuned_values, with_choice
 from faintspot.experiments.closed_loop.results import MagnitudeResult
 from faintspot.experiments.closed_loop.search import (

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from faintspot.base.config.options import Option
 from faintspot.base.errors import InputError
+from faintspot.base.options import Option
 from faintspot.experiments.methods import Choice
 from faintspot.loop.control.base import INTEGRATOR, KALMAN
 from faintspot.loop.simulation.configuration.configuration import LoopConfiguration

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.stats import theilslopes
 
 from faintspot.base.checks import number_between
-from faintspot.base.json_text import parse_json, to_json
+from faintspot.base.text_files import parse_json, to_json
 from faintspot.experiments.closed_loop.methods import LOOP_GAIN, Tunable, tuned_values, with_choice
 from faintspot.experiments.methods import Choice
 from faintspot.experiments.running import Advance

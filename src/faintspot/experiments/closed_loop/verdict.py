@@ -7,10 +7,10 @@ import tomllib
 
 import numpy as np
 
-from faintspot.base.json_text import parse_json
 from faintspot.base.report.page import Table
 from faintspot.base.report.texts import Texts, plain_number, with_error, with_interval
 from faintspot.base.statistics import Estimate, paired_mean
+from faintspot.base.text_files import parse_json
 from faintspot.experiments.closed_loop.methods import LOOP_GAIN
 from faintspot.experiments.closed_loop.results import (
     MagnitudeResult,

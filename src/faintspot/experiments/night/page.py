@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from faintspot.base.errors import InputError
 from faintspot.base.files import write_atomically
-from faintspot.base.json_text import to_json
 from faintspot.base.report.page import (
     FigureWithData,
     Report,
@@ -25,6 +24,7 @@ from faintspot.base.report.page import (
 from faintspot.base.report.plots import FLUX_GREY, METHOD_COLOURS, WIDTH, Line, Panel
 from faintspot.base.report.texts import Texts, with_error
 from faintspot.base.statistics import Estimate
+from faintspot.base.text_files import to_json
 from faintspot.experiments.night.analysis import (
     ALL_STRENGTHS,
     BEST,

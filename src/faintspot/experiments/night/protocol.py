@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.checks import number_between
-from faintspot.base.config.options import LIST, TEXTS, Options, number, setting
 from faintspot.base.errors import InputError
+from faintspot.base.options import LIST, TEXTS, Options, number, setting
 from faintspot.experiments.closed_loop.methods import with_choice
 from faintspot.loop.control.base import INTEGRATOR
 from faintspot.loop.simulation.configuration.configuration import LoopConfiguration

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.base.toml_files import parse_text
+from faintspot.base.text_files import parse_text
 from faintspot.io.telemetry.recording import Telemetry
 from faintspot.loop.control.base import CONTROLS, INTEGRATOR, KALMAN, split_control
 from faintspot.loop.control.options import ControlOptions

@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from faintspot.base.config.tables import save_tables
 from faintspot.base.errors import InputError
 from faintspot.base.statistics import Estimate, SlopeStatistics
+from faintspot.base.tables import save_tables
 from faintspot.experiments.curves import Curve
 from faintspot.experiments.methods import Knowledge
 from faintspot.experiments.planner.promise import Promise

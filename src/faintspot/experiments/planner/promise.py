@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.base.checks import not_none
-from faintspot.base.generators import spawn
+from faintspot.base.checks import not_none, spawn
 from faintspot.base.statistics import Estimate
 from faintspot.experiments.planner.question import Question
 from faintspot.loop.simulation.methods import Method

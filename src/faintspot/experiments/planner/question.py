@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.checks import not_none
-from faintspot.base.config.options import TEXT, setting
 from faintspot.base.errors import InputError
+from faintspot.base.options import TEXT, setting
 from faintspot.experiments.planner.stated import Spots, StatedCamera, StatedOptics, positive
 from faintspot.slopes.camera.calibration import Calibration
 from faintspot.slopes.estimators.scene import Scene

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.base.generators import spawn
+from faintspot.base.checks import spawn
 from faintspot.experiments.planner.question import Question
 from faintspot.loop.simulation.methods import Method
 from faintspot.slopes.camera.calibration import Calibration

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.base.config.options import Options, number, setting
+from faintspot.base.checks import spawn
 from faintspot.base.errors import InputError
-from faintspot.base.generators import spawn
+from faintspot.base.options import Options, number, setting
 from faintspot.slopes.camera.calibration import Calibration
 from faintspot.slopes.camera.detector import Detector
 from faintspot.slopes.estimators.scene import PIXEL_BLUR_PX2

@@ -10,9 +10,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.base.checks import number_between
+from faintspot.base.checks import number_between, spawn
 from faintspot.base.errors import InputError
-from faintspot.base.generators import spawn
 from faintspot.base.statistics import OUTLIER_PX, Estimate, SlopeStatistics, absolute_errors, slope_statistics
 from faintspot.experiments.curves import Curve, limiting_flux, magnitude_gain
 from faintspot.experiments.methods import (

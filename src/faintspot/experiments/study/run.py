@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from faintspot.base import __version__
 from faintspot.base.errors import InputError, MissingExtraError
 from faintspot.base.report.texts import Texts
 from faintspot.base.statistics import OUTLIER_PX
-from faintspot.base.version import __version__
 from faintspot.experiments.running import Advance, Unit, WorkerPool, run_units
 from faintspot.experiments.store import (
     DONE,

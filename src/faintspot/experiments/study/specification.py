@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 
 from faintspot.base.checks import number_between, one_of, strings_of
-from faintspot.base.config.options import FLAG, LIST, REQUIRED, TEXT, Option, Options, number, setting
-from faintspot.base.config.tables import tables_as_text
 from faintspot.base.errors import InputError, errors_within
-from faintspot.base.sizes import check_size
-from faintspot.base.toml_files import check_keys, checked_table, parse_text, read_text
+from faintspot.base.files import check_size
+from faintspot.base.options import FLAG, LIST, REQUIRED, TEXT, Option, Options, number, setting
+from faintspot.base.tables import tables_as_text
+from faintspot.base.text_files import check_keys, checked_table, parse_text, read_text
 from faintspot.experiments.methods import DEFAULT_METHODS, knows_the_spot
 from faintspot.experiments.store import fingerprint_of
 from faintspot.experiments.study.sweep import PARAMETERS, RANGES, Cell, Sweep

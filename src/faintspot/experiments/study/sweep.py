@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 
 from faintspot.base.checks import numbers_between, one_of
-from faintspot.base.config.options import Option
 from faintspot.base.errors import InputError
+from faintspot.base.options import Option
 from faintspot.slopes.camera.detector import Detector
 
 PROFILES = ("diffraction", "gaussian")

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.base.sizes import check_bytes
+from faintspot.base.files import check_bytes
 from faintspot.io.arrays.fits_units import HeaderDataUnit, StreamedArray
 from faintspot.io.arrays.stored_array import MOST_WHOLE_BYTES
 

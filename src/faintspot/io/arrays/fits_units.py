@@ -16,8 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from faintspot.base.errors import InputError, MissingExtraError
-from faintspot.base.files import check_regular, write_atomically
-from faintspot.base.sizes import check_bytes
+from faintspot.base.files import check_bytes, check_regular, write_atomically
 from faintspot.io.arrays.inflation import check_inflated, is_surely_small
 from faintspot.io.arrays.stored_array import MOST_WHOLE_BYTES
 from faintspot.io.locations import one_line

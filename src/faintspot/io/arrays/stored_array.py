@@ -12,8 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.errors import InputError, MissingExtraError
-from faintspot.base.files import Closing
-from faintspot.base.sizes import check_bytes
+from faintspot.base.files import Closing, check_bytes
 from faintspot.io.locations import one_line
 
 MOST_WHOLE_BYTES = 1 << 30

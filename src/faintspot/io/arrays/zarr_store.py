@@ -14,9 +14,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.errors import InputError
-from faintspot.base.files import check_file_size, read_bytes, replace_file, sync_file, sync_folder
-from faintspot.base.json_text import parse_json, to_json
-from faintspot.base.sizes import MOST_TEXT_BYTES, check_bytes
+from faintspot.base.files import (
+    MOST_TEXT_BYTES,
+    check_bytes,
+    check_file_size,
+    read_bytes,
+    replace_file,
+    sync_file,
+    sync_folder,
+)
+from faintspot.base.text_files import parse_json, to_json
 from faintspot.io.arrays.inflation import check_inflated, is_surely_small
 from faintspot.io.arrays.stored_array import MOST_WHOLE_BYTES
 from faintspot.io.locations import one_line

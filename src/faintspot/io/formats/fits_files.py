@@ -17,9 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.errors import InputError
-from faintspot.base.json_text import parse_json, to_json
-from faintspot.base.sizes import check_bytes
-from faintspot.base.variables import VARIABLES
+from faintspot.base.files import check_bytes
+from faintspot.base.flags import VARIABLES
+from faintspot.base.text_files import parse_json, to_json
 from faintspot.io.arrays.fits_tables import Column, ColumnValues, columns_of, is_table
 from faintspot.io.arrays.fits_units import (
     AOT_VERSION,

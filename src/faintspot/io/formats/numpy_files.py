@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from faintspot.base.errors import InputError
 from faintspot.base.files import check_regular, unpacked
-from faintspot.base.json_text import parse_json, to_json
-from faintspot.base.variables import VARIABLES
+from faintspot.base.flags import VARIABLES
+from faintspot.base.text_files import parse_json, to_json
 from faintspot.io.arrays.fits_units import StreamedArray, check_present
 from faintspot.io.arrays.stored_array import MOST_WHOLE_BYTES, StoredArray
 from faintspot.io.formats.file_format import FileFormat

@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
-from faintspot.base.errors import InputError
-from faintspot.base.extras import import_modules
+from faintspot.base.errors import InputError, import_modules
 from faintspot.base.files import check_regular
 from faintspot.io.formats.file_format import FileFormat
 

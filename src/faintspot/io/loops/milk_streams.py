@@ -16,8 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.errors import InputError
-from faintspot.base.files import check_regular
-from faintspot.base.sizes import check_bytes, memory_bytes
+from faintspot.base.files import check_bytes, check_regular, memory_bytes
 from faintspot.io.frames import read_array
 
 _ENDING = re.compile(r"\.fits(\.fz|\.gz)?$")

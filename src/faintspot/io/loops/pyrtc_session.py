@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from faintspot.base.errors import InputError
 from faintspot.base.files import check_regular
-from faintspot.base.json_text import parse_json
+from faintspot.base.text_files import parse_json
 
 _MANIFEST = "session.json"
 _SLOPES, _COMMANDS = "signal", "wfc"

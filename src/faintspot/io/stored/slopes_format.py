@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.errors import InputError
-from faintspot.base.json_text import plain_values
-from faintspot.base.sizes import check_bytes, memory_bytes
-from faintspot.base.variables import VARIABLES
+from faintspot.base.files import check_bytes, memory_bytes
+from faintspot.base.flags import VARIABLES
+from faintspot.base.text_files import plain_values
 
 REQUIRED = frozenset(name for name, variable in VARIABLES.items() if variable.if_absent is None)
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from faintspot.base.errors import InputError
 from faintspot.base.files import Closing, output_errors, replace_file
-from faintspot.base.variables import VARIABLES
+from faintspot.base.flags import VARIABLES
 from faintspot.io.optional_packages import load_filelock
 from faintspot.io.stored.slopes_format import RecordingHeader, StoredSlopes, checked_block
 from faintspot.io.stored.slopes_zarr import SlopeStore, remove_store

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from faintspot.base.errors import InputError
 from faintspot.base.files import sync_file, sync_folder
-from faintspot.base.variables import VARIABLES
+from faintspot.base.flags import VARIABLES
 from faintspot.io.arrays.zarr_store import (
     checked_codecs,
     chunk_files,

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from faintspot.base.checks import finite_array
 from faintspot.base.errors import InputError, MissingExtraError
-from faintspot.base.json_text import parse_json
-from faintspot.base.sizes import check_bytes, memory_bytes
+from faintspot.base.files import check_bytes, memory_bytes
+from faintspot.base.text_files import parse_json
 from faintspot.io.arrays.fits_units import AOT_VERSION, is_aot, units_of
 from faintspot.io.locations import one_line
 

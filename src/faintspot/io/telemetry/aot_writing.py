@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 from faintspot.base.checks import one_of
 from faintspot.base.errors import InputError, MissingExtraError
 from faintspot.base.files import write_atomically
-from faintspot.base.json_text import to_json
-from faintspot.base.toml_files import parse_text
+from faintspot.base.text_files import parse_text, to_json
 from faintspot.io.telemetry.aot_reading import FLAGS_COLUMN, NOISE, NOISE_COLUMNS
 from faintspot.io.telemetry.recording import Telemetry
 

@@ -13,9 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.errors import InputError
-from faintspot.base.flags import are_valid
-from faintspot.base.sizes import check_bytes, memory_bytes
-from faintspot.base.variables import VARIABLES
+from faintspot.base.files import check_bytes, memory_bytes
+from faintspot.base.flags import VARIABLES, are_valid
 from faintspot.io.arrays.zarr_store import (
     TELEMETRY,
     is_store,

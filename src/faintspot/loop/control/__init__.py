@@ -11,7 +11,7 @@ For the loops of other systems: `Recording`, learning and `PredictiveControl`.
 
 from typing import TYPE_CHECKING
 
-from faintspot.base.extras import lazy_attributes
+from faintspot.base.errors import lazy_attributes
 
 if TYPE_CHECKING:
     from faintspot.loop.control.identification.predictive_control import (

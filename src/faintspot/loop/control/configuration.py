@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.checks import finite_array
-from faintspot.base.config.tables import Tables, save_tables
 from faintspot.base.errors import InputError, errors_within
-from faintspot.base.toml_files import check_keys
+from faintspot.base.tables import Tables, save_tables
+from faintspot.base.text_files import check_keys
 from faintspot.loop.control.base import CONTROLS, INTEGRATOR, KALMAN, CommandDelayLine, Controller
 from faintspot.loop.control.integrator import CompiledIntegrator
 from faintspot.loop.control.options import BEYOND_ALL, CONTROLLER, NONE, STREAM, TABLE, ControlOptions

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from faintspot.base.config.options import Options, setting
+from faintspot.base.options import Options, setting
 from faintspot.loop.control.base import CONTROLS, INTEGRATOR
 from faintspot.loop.control.removed_modes import REMOVED_MODES
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from faintspot.base.extras import lazy_attributes
+from faintspot.base.errors import lazy_attributes
 
 if TYPE_CHECKING:
     from faintspot.loop.simulation.configuration.configuration import LoopConfiguration as LoopConfiguration

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.checks import one_of
-from faintspot.base.config.options import AUTO, REQUIRED, TEXT, TEXTS, Options, number, setting
 from faintspot.base.errors import InputError
+from faintspot.base.options import AUTO, REQUIRED, TEXT, TEXTS, Options, number, setting
 from faintspot.loop.control.base import CONTROLS, INTEGRATOR, KALMAN
 from faintspot.slopes.estimators.base import Estimator
 from faintspot.slopes.estimators.built_in.window import Window

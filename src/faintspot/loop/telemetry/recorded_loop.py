@@ -15,7 +15,7 @@ from faintspot.base.checks import finite_array, increasing, one_of, real_array
 from faintspot.base.errors import InputError, errors_within
 from faintspot.base.files import read_arrays
 from faintspot.base.flags import NO_FLAG, SubapertureFlag, leave_out
-from faintspot.base.toml_files import check_keys, parse_file
+from faintspot.base.text_files import check_keys, parse_file
 from faintspot.io import StoredSlopes
 from faintspot.io.arrays.fits_units import is_aot
 from faintspot.io.arrays.zarr_store import holds_telemetry

@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.checks import number_between, numbers_between, real_array
-from faintspot.base.config.options import TEXTS, number, setting
-from faintspot.base.config.tables import ConfigurationTable, Tables, is_map, save_tables
 from faintspot.base.errors import InputError, errors_within
 from faintspot.base.files import derived, save_arrays
+from faintspot.base.options import TEXTS, number, setting
+from faintspot.base.tables import ConfigurationTable, Tables, is_map, save_tables
 
 _BLOCK_PIXELS = 1 << 22  # processed at a time
 _ESTIMATED = ("dark", "gain_e_per_adu", "saturation_adu", "bad_pixels", "read_noise_e")

@@ -10,8 +10,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.base.config.tables import is_map
 from faintspot.base.statistics import MAD_TO_STD
+from faintspot.base.tables import is_map
 from faintspot.slopes.camera.calibration import Calibration
 from faintspot.slopes.camera.frame_checks import find_hot_pixels
 from faintspot.slopes.sensor.layout import Layout

@@ -9,10 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from faintspot.base.checks import finite_array, number_between, numbers_between
-from faintspot.base.config.options import Options, number, setting
+from faintspot.base.checks import finite_array, number_between, numbers_between, spawn
 from faintspot.base.errors import InputError
-from faintspot.base.generators import spawn
+from faintspot.base.options import Options, number, setting
 
 LARGEST_MEAN_E = 1e12
 """Largest mean number of electrons per pixel accepted (far above any full well)."""

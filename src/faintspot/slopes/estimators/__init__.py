@@ -8,10 +8,10 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from faintspot.base.extras import lazy_attributes
+from faintspot.base.errors import lazy_attributes
 
 if TYPE_CHECKING:
-    from faintspot.base.config.options import option as option
+    from faintspot.base.options import option as option
     from faintspot.slopes.estimators.base import Estimator as Estimator
     from faintspot.slopes.estimators.base import Need as Need
     from faintspot.slopes.estimators.base import Positions as Positions
@@ -31,7 +31,7 @@ _HOMES = {
     "Style": "faintspot.slopes.estimators.base",
     "estimator_named": "faintspot.slopes.estimators.registry",
     "estimators": "faintspot.slopes.estimators.registry",
-    "option": "faintspot.base.config.options",
+    "option": "faintspot.base.options",
     "register": "faintspot.slopes.estimators.registry",
 }
 

@@ -14,8 +14,8 @@ from typing import Any, ClassVar, NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.base.config.options import Options, is_auto
 from faintspot.base.errors import InputError
+from faintspot.base.options import Options, is_auto
 from faintspot.slopes.estimators.scene import Scene
 from faintspot.slopes.estimators.sensor import Sensor
 from faintspot.slopes.kernels.driver.groups import COMMON_ROWS, flux_of_groups

@@ -13,9 +13,8 @@ from importlib.metadata import entry_points
 from types import FrameType
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from faintspot.base.config.options import Option, Options
-from faintspot.base.errors import InputError
-from faintspot.base.extras import import_modules
+from faintspot.base.errors import InputError, import_modules
+from faintspot.base.options import Option, Options
 from faintspot.slopes.estimators.base import Estimator, Need
 
 if TYPE_CHECKING:

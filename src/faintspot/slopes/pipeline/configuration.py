@@ -12,10 +12,10 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
-from faintspot.base.config.tables import Tables, save_tables, tables_as_text
 from faintspot.base.errors import InputError, errors_within
 from faintspot.base.files import derived
-from faintspot.base.toml_files import check_keys
+from faintspot.base.tables import Tables, save_tables, tables_as_text
+from faintspot.base.text_files import check_keys
 from faintspot.slopes.camera.calibration import Calibration
 from faintspot.slopes.pipeline.settings import Settings
 from faintspot.slopes.sensor.binning import binned_layout

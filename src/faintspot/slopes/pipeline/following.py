@@ -12,9 +12,8 @@ from scipy.spatial import cKDTree
 
 from faintspot.base.checks import LARGEST_FLOAT32, real_array
 from faintspot.base.errors import InputError
-from faintspot.base.flags import UNMEASURED, SubapertureFlag
+from faintspot.base.flags import UNMEASURED, SubapertureFlag, scaled_positions
 from faintspot.base.statistics import MAD_TO_STD
-from faintspot.base.variables import scaled_positions
 from faintspot.slopes.camera.binning import binned
 from faintspot.slopes.camera.calibration import Calibration
 from faintspot.slopes.estimators.base import Estimator

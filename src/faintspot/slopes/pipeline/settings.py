@@ -10,10 +10,10 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.base.config.options import Option, Options, PerSubaperture, check_lengths, option
-from faintspot.base.config.tables import Tables, per_subaperture, save_tables
 from faintspot.base.errors import InputError, errors_within
-from faintspot.base.toml_files import check_known
+from faintspot.base.options import Option, Options, PerSubaperture, check_lengths, option
+from faintspot.base.tables import Tables, per_subaperture, save_tables
+from faintspot.base.text_files import check_known
 from faintspot.slopes.estimators.base import Estimator
 from faintspot.slopes.estimators.registry import estimator_named, estimators
 

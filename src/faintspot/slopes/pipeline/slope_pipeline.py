@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from faintspot.base.checks import number_between, numbers_between, real_array
 from faintspot.base.errors import InputError
-from faintspot.base.variables import scaled_positions
+from faintspot.base.flags import scaled_positions
 from faintspot.slopes.camera.binning import binned, binned_calibration, spread
 from faintspot.slopes.camera.calibration import Calibration
 from faintspot.slopes.estimators.base import Estimator

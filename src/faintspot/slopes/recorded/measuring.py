@@ -12,11 +12,10 @@ from typing import TYPE_CHECKING, Any, TypedDict, Unpack
 import numpy as np
 from numpy.typing import NDArray
 
+from faintspot.base import __version__
 from faintspot.base.checks import one_of
 from faintspot.base.errors import InputError, errors_within
-from faintspot.base.flags import SubapertureFlag, kept_flags
-from faintspot.base.variables import scaled_positions
-from faintspot.base.version import __version__
+from faintspot.base.flags import SubapertureFlag, kept_flags, scaled_positions
 from faintspot.io.frames import FrameSource, open_frames
 from faintspot.io.locations import split_location
 from faintspot.io.slopes import create_writer, read_reference

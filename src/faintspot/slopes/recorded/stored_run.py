@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from faintspot.base.errors import DoubtWarning, InputError
 from faintspot.base.flags import SubapertureFlag, are_valid, kept_flags
-from faintspot.base.toml_files import parse_text
+from faintspot.base.text_files import parse_text
 from faintspot.io import StoredSlopes, read_slopes
 from faintspot.io.slopes import subtracted_reference
 from faintspot.slopes.camera.calibration import Calibration

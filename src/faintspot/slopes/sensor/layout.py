@@ -13,11 +13,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from faintspot.base.checks import number_between, numbers_between
-from faintspot.base.config.options import TEXTS, number, setting
-from faintspot.base.config.tables import ConfigurationTable
 from faintspot.base.errors import DoubtWarning, InputError, errors_within
-from faintspot.base.sizes import check_size
-from faintspot.base.toml_files import check_keys, checked_table
+from faintspot.base.files import check_size
+from faintspot.base.options import TEXTS, number, setting
+from faintspot.base.tables import ConfigurationTable
+from faintspot.base.text_files import check_keys, checked_table
 from faintspot.slopes.sensor.window_checks import (
     check_centres,
     check_inside,

@@ -9,9 +9,8 @@ from typing import Any, Unpack
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from faintspot.base.checks import finite_array, number_between
+from faintspot.base.checks import finite_array, number_between, spawn
 from faintspot.base.errors import InputError
-from faintspot.base.generators import spawn
 from faintspot.slopes.camera.detector import Detector
 from faintspot.slopes.sensor.layout import Layout
 from faintspot.slopes.spots.psf import PSF

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from faintspot.base.checks import finite_array, not_none, numbers_between
-from faintspot.base.config.options import REQUIRED, Options, number, setting
+from faintspot.base.options import REQUIRED, Options, number, setting
 
 # Flux density (Jy) at magnitude 0 and relative width of the band: Bessell 1979 (PASP 91, 589) for B to I,
 # Campins, Rieke & Lebofsky 1985 (AJ 90, 896) for J to K.

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from faintspot.base.checks import number_between, numbers_between
 from faintspot.base.errors import InputError
-from faintspot.base.sizes import check_size
+from faintspot.base.files import check_size
 from faintspot.slopes.spots.psf import PSF
 from faintspot.slopes.spots.shapes import image_shape, position_array
 from faintspot.slopes.spots.sodium import SodiumProfile, integration_points

@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from faintspot.base.checks import numbers_between
-from faintspot.base.config.options import FLAG, REQUIRED, number, setting
-from faintspot.base.config.tables import ConfigurationTable
 from faintspot.base.errors import InputError, errors_within
+from faintspot.base.options import FLAG, REQUIRED, number, setting
+from faintspot.base.tables import ConfigurationTable
 from faintspot.slopes.camera.calibration import Calibration
 from faintspot.slopes.sensor.layout import Layout
 from faintspot.slopes.sensor.pupil import lenslet_pitch, pupil_of, side_m

@@ -11,8 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from faintspot.base.checks import LARGEST_FLOAT32, number_between, numbers_between
 from faintspot.base.errors import InputError
-from faintspot.base.files import NpzFile
-from faintspot.base.sizes import check_size
+from faintspot.base.files import NpzFile, check_size
 from faintspot.slopes.spots.shapes import image_shape, per_spot, position_array, spots
 
 Floats = NDArray[np.float64]

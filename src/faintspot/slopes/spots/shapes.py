@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from faintspot.base.checks import finite_array, numbers_between, one_of
 from faintspot.base.errors import InputError
-from faintspot.base.sizes import check_size
+from faintspot.base.files import check_size
 
 Floats = NDArray[np.float64]
 

@@ -9,9 +9,8 @@ from typing import NamedTuple, Required, TypedDict, Unpack
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from faintspot.base.checks import finite_array, number_between, numbers_between, one_of
+from faintspot.base.checks import finite_array, number_between, numbers_between, one_of, spawn
 from faintspot.base.errors import InputError
-from faintspot.base.generators import spawn
 from faintspot.slopes.spots.shapes import SMALLEST_SIZE, image_shape, per_spot
 from faintspot.slopes.spots.von_karman import structure_function
 

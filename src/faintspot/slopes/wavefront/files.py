@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 
 from faintspot.base.files import check_ending, write_atomically
-from faintspot.base.json_text import to_json
 from faintspot.base.report.texts import NOTHING, Texts, number_or_dash, signed
 from faintspot.base.statistics import Estimate
+from faintspot.base.text_files import to_json
 from faintspot.slopes.wavefront.certificate import Certificate, certify
 from faintspot.slopes.wavefront.drift import Drift
 from faintspot.slopes.wavefront.fit import NM, Floats, Wavefront, total

@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from faintspot.base.json_text import plain_values
+from faintspot.base.text_files import plain_values
 from faintspot.loop.control.identification.open_loop import Measured, outer_scale_and_r0
 from faintspot.loop.turbulence.strength import TurbulenceStrength
 

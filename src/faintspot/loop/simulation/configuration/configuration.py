@@ -11,10 +11,10 @@ from typing import Any
 
 import numpy as np
 
-from faintspot.base.config.tables import ConfigurationTable, tables_as_text
 from faintspot.base.errors import InputError, errors_within
-from faintspot.base.sizes import check_size
-from faintspot.base.toml_files import check_keys, check_known, checked_table, parse_file, parse_text
+from faintspot.base.files import check_size
+from faintspot.base.tables import ConfigurationTable, tables_as_text
+from faintspot.base.text_files import check_keys, check_known, checked_table, parse_file, parse_text
 from faintspot.loop.simulation.configuration.sections import (
     CLOSED,
     OPEN,

@@ -8,9 +8,9 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from faintspot.base.checks import number_between, numbers_between
-from faintspot.base.config.options import FLAG, LIST, NUMBER_OR_LIST, number, setting
-from faintspot.base.config.tables import ConfigurationTable
 from faintspot.base.errors import InputError
+from faintspot.base.options import FLAG, LIST, NUMBER_OR_LIST, number, setting
+from faintspot.base.tables import ConfigurationTable
 from faintspot.loop.control.base import LEARNT, WINDS
 from faintspot.slopes.simulate.photometry import StarLight
 from faintspot.slopes.spots.sodium import SodiumProfile, integration_points

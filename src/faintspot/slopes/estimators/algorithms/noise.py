@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from faintspot.base.checks import image_stack, number_between, numbers_between, one_of
-from faintspot.base.config.tables import PRESETS, of_denoising
 from faintspot.base.errors import InputError
 from faintspot.base.statistics import MAD_TO_STD
+from faintspot.base.tables import PRESETS, of_denoising
 from faintspot.slopes.kernels.compilation.host import lanes_for
 from faintspot.slopes.kernels.gravity.stacks import denoise_stack
 from faintspot.slopes.kernels.parallel import run_groups

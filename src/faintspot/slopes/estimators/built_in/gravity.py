@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.checks import LARGEST_FLOAT32
-from faintspot.base.config.options import Value, is_auto, option
 from faintspot.base.errors import InputError
+from faintspot.base.options import Value, is_auto, option
 from faintspot.slopes.estimators.algorithms.automatic import automatic_kept_pixels
 from faintspot.slopes.estimators.algorithms.centroid import RULES, most_kept, threshold_rank
 from faintspot.slopes.estimators.base import (

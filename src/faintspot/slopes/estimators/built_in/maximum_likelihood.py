@@ -11,9 +11,9 @@ from typing import ClassVar, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.base.config.options import Value, option
-from faintspot.base.config.tables import PRESETS
-from faintspot.base.sizes import MOST_NUMBERS, check_size
+from faintspot.base.files import MOST_NUMBERS, check_size
+from faintspot.base.options import Value, option
+from faintspot.base.tables import PRESETS
 from faintspot.slopes.estimators import spot_tables
 from faintspot.slopes.estimators.base import Estimator, Need, Style
 from faintspot.slopes.estimators.registry import register

@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.base.config.options import Value, option
+from faintspot.base.options import Value, option
 from faintspot.slopes.estimators.algorithms.automatic import automatic_smoothing
 from faintspot.slopes.estimators.base import BACKGROUND, CALIBRATED, RAW, Step, Style
 from faintspot.slopes.estimators.built_in.gravity import BrightestPixels, GravityPlan, KeepingBrightest

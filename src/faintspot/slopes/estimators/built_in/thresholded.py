@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.base.config.options import Value, option
 from faintspot.base.errors import InputError
+from faintspot.base.options import Value, option
 from faintspot.slopes.estimators.base import Style
 from faintspot.slopes.estimators.built_in.gravity import Centroid, Floats, GravityPlan
 from faintspot.slopes.estimators.registry import register

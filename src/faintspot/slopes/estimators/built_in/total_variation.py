@@ -10,9 +10,9 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.base.config.options import PerSubaperture, Value, is_auto, option
-from faintspot.base.config.tables import FEW_KEPT, PRESETS, of_denoising
 from faintspot.base.errors import InputError
+from faintspot.base.options import PerSubaperture, Value, is_auto, option
+from faintspot.base.tables import FEW_KEPT, PRESETS, of_denoising
 from faintspot.slopes.estimators.algorithms.automatic import automatic_strength
 from faintspot.slopes.estimators.algorithms.noise import ALGORITHMS, suggested_strength, tv_denoise
 from faintspot.slopes.estimators.base import BACKGROUND, CALIBRATED, RAW, Estimator, Step, Style

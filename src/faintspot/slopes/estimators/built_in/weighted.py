@@ -9,8 +9,8 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from faintspot.base.config.options import Value, option
-from faintspot.base.config.tables import PRESETS
+from faintspot.base.options import Value, option
+from faintspot.base.tables import PRESETS
 from faintspot.slopes.estimators import spot_tables
 from faintspot.slopes.estimators.base import Need, Style
 from faintspot.slopes.estimators.registry import register

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.checks import not_none
-from faintspot.base.config.options import Value, option
 from faintspot.base.errors import InputError
+from faintspot.base.options import Value, option
 from faintspot.slopes.estimators.base import Estimator, EstimatorPlan, Need, Style
 from faintspot.slopes.estimators.registry import register
 from faintspot.slopes.estimators.scene import Scene

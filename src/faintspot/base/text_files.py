@@ -1,12 +1,16 @@
-"""TOML files: read with one-line errors; unknown names are rejected with a suggestion."""
+"""TOML and JSON texts: read with one-line errors and suggestions for unknown names; JSON without NaN."""
 
 from __future__ import annotations
 
 import difflib
+import json
+import math
 import tomllib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
+
+import numpy as np
 
 from faintspot.base.errors import InputError
 from faintspot.base.files import read_bytes
@@ -116,3 +120,60 @@ def checked_table(where: str, value: object) -> dict[str, Any]:
     if not isinstance(value, dict):
         raise InputError(f"{where}: expected a table, got {value!r}")
     return value
+
+
+def to_json(value: object, *, indent: int | None = None, exact: bool = False) -> str:
+    """Return JSON text that every reader accepts.
+
+    Parameters
+    ----------
+    value
+        Mappings, sequences, NumPy arrays and numbers, paths and plain values.
+    indent : int, optional
+    exact : bool
+        Whether to refuse values that JSON lacks. Otherwise numbers that are not finite become null (unknown),
+        and other objects text.
+
+    Raises
+    ------
+    ValueError, TypeError
+        With `exact`, for a number that is not finite, or another object.
+    """
+    return json.dumps(plain_values(value, exact=exact), indent=indent, allow_nan=False)
+
+
+def plain_values(value: object, *, exact: bool = False) -> Any:
+    """Return a value as JSON allows it; parameters and errors are those of `to_json`."""
+    if isinstance(value, np.ndarray | np.generic):
+        value = value.tolist()
+    if isinstance(value, Mapping):
+        return {str(key): plain_values(item, exact=exact) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain_values(item, exact=exact) for item in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        if exact:
+            raise ValueError(f"{value} is not a finite number")
+        return None
+    if value is None or isinstance(value, bool | int | float | str):
+        return value
+    if exact and not isinstance(value, Path):
+        raise TypeError(f"{type(value).__name__} is neither number nor text")
+    return str(value)
+
+
+def parse_json(text: str | bytes) -> Any:
+    """Return the content of a JSON text.
+
+    Raises
+    ------
+    ValueError
+        If it is not JSON, holds NaN or infinity, or is nested too deeply for Python.
+    """
+    try:
+        return json.loads(text, parse_constant=_refused)
+    except RecursionError:
+        raise ValueError("nested too deeply") from None
+
+
+def _refused(constant: str) -> NoReturn:
+    raise ValueError(f"{constant} is not JSON")

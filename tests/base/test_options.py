@@ -9,7 +9,7 @@ import pytest
 from tests.refusals import refused
 
 import faintspot as fs
-from faintspot.base.config.options import Options, PerSubaperture, check_lengths, is_auto, option
+from faintspot.base.options import Options, PerSubaperture, check_lengths, is_auto, option
 from faintspot.slopes.estimators import estimators
 
 

@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from tests.refusals import refused
 
-from faintspot.base.config.tables import parse_changes, parse_ranges
 from faintspot.base.errors import InputError
+from faintspot.base.tables import parse_changes, parse_ranges
 
 
 def test_parsing_changes() -> None:
@@ -59,7 +59,7 @@ def test_any_text_is_parsed_or_refused_in_one_line(text: str) -> None:
 
 @pytest.mark.slow
 def test_commands_that_only_ask_import_nothing_that_takes_time() -> None:
-    modules = "faintspot.cli.realtime, faintspot.base.config.tables"
+    modules = "faintspot.cli.realtime, faintspot.base.tables"
     code = f"import {modules}, sys; print(*sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert not {"numba", "scipy", "faintspot.slopes.pipeline.slope_pipeline"} & set(done.stdout.split())

@@ -9,10 +9,10 @@ from typing import Any, Self, TypeVar
 
 import numpy as np
 
-from faintspot.base.config.options import Options, PerSubaperture
 from faintspot.base.errors import InputError, errors_within
 from faintspot.base.files import write_atomically
-from faintspot.base.toml_files import check_keys, checked_table, parse_file, read_text
+from faintspot.base.options import Options, PerSubaperture
+from faintspot.base.text_files import check_keys, checked_table, parse_file, read_text
 
 PRESETS = ("accurate", "fast")
 

@@ -1,1 +1,0 @@
-"""Options, tables and presets of a configuration."""

@@ -1,0 +1,136 @@
+"""TOML and JSON texts: errors in one line, and JSON without NaN."""
+
+import json
+import math
+import os
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import faintspot
+from faintspot.base import text_files
+from faintspot.base.errors import InputError
+from faintspot.base.text_files import parse_json, plain_values, to_json
+
+
+def refused(path: Path, content: bytes | None, if_missing: str = "") -> str:
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(InputError) as error:
+        text_files.parse_file(path, if_missing=if_missing)
+    assert str(error.value).startswith(f"{path}: ")
+    assert "\n" not in str(error.value)
+    return str(error.value).removeprefix(f"{path}: ")
+
+
+def test_a_file_gives_its_tables(tmp_path: Path) -> None:
+    path = tmp_path / "a.toml"
+    path.write_text('# a comment\n[table]\nname = "é"\n', encoding="utf-8")
+    assert text_files.parse_file(path) == {"table": {"name": "é"}}
+
+
+def test_files_that_cannot_be_read(tmp_path: Path) -> None:
+    path = tmp_path / "a.toml"
+    assert refused(path, None) == "no such file"
+    assert refused(path, None, "`make demo` makes one") == "no such file; `make demo` makes one"
+    assert refused(path, b"\xff\xfe") == "not a TOML file: it is not UTF-8 text"
+    assert refused(path, b"a = 1\nb = [1,,2]") == "not a TOML file: Invalid value (at line 2, column 8)"
+    for content in (b"a = 2020-13-45", b"a = " + b"[" * 5000, b"a = " + b"9" * 5000):
+        assert refused(path, content).startswith("not a TOML file: ")
+    assert refused(tmp_path, None) == "cannot be read (Is a directory)"
+
+
+def test_files_that_are_too_large_or_have_no_end(tmp_path: Path) -> None:
+    corners = b"corners = [" + b"[1, 2]," * 10**6 + b"]"
+    assert "expected a TOML file of at most" in refused(tmp_path / "a.toml", corners)
+    os.mkfifo(tmp_path / "pipe.toml")
+    assert refused(tmp_path / "pipe.toml", None) == "expected a regular file, got a named pipe"
+    (tmp_path / "zero.toml").symlink_to("/dev/zero")
+    assert "expected a regular file" in refused(tmp_path / "zero.toml", None)
+
+
+def test_a_text_gives_its_tables_or_says_where_it_is_wrong() -> None:
+    assert text_files.parse_text("a = 1", "there") == {"a": 1}
+    with pytest.raises(InputError, match=r"^there: not a TOML file"):
+        text_files.parse_text("a = ", "there")
+
+
+@pytest.mark.parametrize(
+    ("table", "message"),
+    [
+        ({"noise_std": 1, "nois_std": 1}, "settings.nois_std: unknown key; did you mean noise_std?"),
+        ({"noise_std": 1, "zzz": 1}, "settings.zzz: unknown key; known: noise_std, rule"),
+        ({"rule": 1}, "settings.noise_std: expected a value, found none"),
+    ],
+)
+def test_unknown_and_missing_keys_are_named(table: dict[str, int], message: str) -> None:
+    text_files.check_keys("settings.", {"noise_std": 1}, ("noise_std", "rule"), required=["noise_std"])
+    with pytest.raises(InputError) as error:
+        text_files.check_keys("settings.", table, ("noise_std", "rule"), required=["noise_std"])
+    assert str(error.value) == message
+
+
+def test_unknown_names_get_a_suggestion() -> None:
+    text_files.check_known("a.toml: ", "layout", ["layout"], "table")
+    with pytest.raises(InputError, match=r"^a\.toml: layuot: unknown table; did you mean layout\?$"):
+        text_files.check_known("a.toml: ", "layuot", (name for name in ["layout"]), "table")
+
+
+def test_what_is_no_table_is_refused() -> None:
+    assert text_files.checked_table("psf", {"a": 1}) == {"a": 1}
+    with pytest.raises(InputError, match=r"^psf: expected a table, got 'text'$"):
+        text_files.checked_table("psf", "text")
+
+
+# The page's server looks for lone surrogates, which text may hold in memory and not in a message.
+OTHERS = {"base/text_files.py", "engine/page/server.py"}
+
+
+def test_values_that_json_lacks_are_written_as_it_has_them() -> None:
+    given = {
+        "inf": np.float64("inf"),
+        3: (np.int64(2), [float("-inf")]),
+        "array": np.array([[1.5, np.nan]], np.float32),
+        "path": Path("a"),
+        "flags": [np.True_, None],
+        "other": 1j,
+    }
+    expected = {
+        "inf": None,
+        "3": [2, [None]],
+        "array": [[1.5, None]],
+        "path": "a",
+        "flags": [True, None],
+        "other": "1j",
+    }
+    assert plain_values(given) == expected
+    assert json.loads(to_json(given)) == expected
+    assert to_json({"a": 1}, indent=1) == '{\n "a": 1\n}'
+
+
+@pytest.mark.parametrize(
+    ("value", "error"), [(math.nan, ValueError), ([math.inf], ValueError), (1j, TypeError)]
+)
+def test_exact_text_holds_values_as_they_are(value: Any, error: type[Exception]) -> None:
+    with pytest.raises(error):
+        to_json({"a": value}, exact=True)
+    assert to_json({"a": Path("b"), "c": np.arange(2)}, exact=True) == '{"a": "b", "c": [0, 1]}'
+
+
+@pytest.mark.parametrize("text", ["[" * 100_000, b"\xff", "{", "NaN", '{"a": [-Infinity]}'])
+def test_text_that_is_not_json_is_refused(text: str | bytes) -> None:
+    assert parse_json('{"a": [1]}') == {"a": [1]}
+    with pytest.raises(ValueError):  # noqa: PT011
+        parse_json(text)
+
+
+def test_all_json_is_written_and_read_here() -> None:
+    package = Path(faintspot.__file__).parent
+    files = sorted(package.rglob("*.py"))
+    assert len(files) > 300
+    imported = re.compile(r"^\s*(?:import|from) json\b", re.MULTILINE)
+    users = {file for file in files if imported.search(file.read_text(encoding="utf-8"))}
+    assert {file.relative_to(package).as_posix() for file in users} == OTHERS
