@@ -65,6 +65,8 @@ class ForeignLoop(ABC):
         The command computed from frame k acts first during frame k + delay.
     winds : list of (speed, direction)
         As given to the package.
+    is_changing : bool
+        Whether the winds change, in loops that can.
     is_slow : bool
         Whether pyRTC and brighter stars are left out, and fewer gains tried.
     is_modal : bool

@@ -244,6 +244,7 @@ def changed(ready: Commissioned, log: Log) -> dict[str, Any]:
     Frames have the pace of the loop, as learning takes its time.
     """
     loop, rate, begin = ready.loop, round(ready.loop.rate_hz), CHANGED_AFTER
+    loop.is_changing = True  # not in the recording that it learnt from
     parts = {
         "before": slice(SETTLE_FRAMES, begin),
         "first second": slice(begin, begin + rate),

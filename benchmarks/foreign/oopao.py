@@ -219,11 +219,13 @@ class OopaoLoop(SteppedLoop):
 
 
 class ChangingLoop(OopaoLoop):
-    """Loop whose winds become faster by 1.6 and turn by 40 degrees after 700 frames."""
+    """Loop whose winds become faster by 1.6 and turn by 40 degrees after 700 frames, once they may."""
+
+    is_changing = False
 
     def paths_m(self, seed: int, frames: int) -> NDArray[np.float32]:
         """See `SteppedLoop`."""
-        if frames <= CHANGED_AFTER:
+        if not self.is_changing or frames <= CHANGED_AFTER:
             return super().paths_m(seed, frames)
         first, winds, atmosphere = super().paths_m(seed, CHANGED_AFTER), self.winds, self._atmosphere
         self.winds = [(1.6 * speed, direction + 40) for speed, direction in winds]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
@@ -13,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from faintspot.base.checks import one_of, real_array
 from faintspot.base.errors import InputError
-from faintspot.base.files import read_arrays, save_arrays
+from faintspot.base.files import read_arrays
 from faintspot.loop.control.base import SETTLE_FRAMES, CommandDelayLine
 from faintspot.loop.control.identification.controlled_loop import LoopOfControl
 from faintspot.loop.control.identification.layers import Identified
@@ -53,7 +54,7 @@ _LEARN_BESIDE = (
     "import sys; from faintspot.loop.control.identification.predictive_control import learn_beside; "
     "learn_beside(sys.argv[1])"
 )
-_CONTROL, _TASK, _BETTER, _RESULT = "control.npz", "frames.npz", "better.npz", "result.txt"
+_TASK, _RESULT = "task.pickle", "result.pickle"  # kept with the covariances, which take long to compute
 
 
 class PredictiveControl:
@@ -350,7 +351,11 @@ class PredictiveControl:
         InputError
             When it cannot be written.
         """
-        _save(path, self._loop, self.model)
+        loop = self._loop
+        known = {
+            f"loop_{name}": np.asarray(value) for name, value in vars(loop).items() if name != "recorded"
+        }
+        self.model.save(path, known | ({} if loop.recorded is None else stored(loop.recorded)))
 
     @classmethod
     def load(cls, path: str | Path) -> PredictiveControl:
@@ -412,33 +417,25 @@ class PredictiveControl:
         return "; ".join(part for part in parts if part)
 
 
-def _save(path: str | Path, loop: LoopOfControl, model: Kalman) -> None:
-    known = {f"loop_{name}": np.asarray(value) for name, value in vars(loop).items() if name != "recorded"}
-    model.save(path, known | ({} if loop.recorded is None else stored(loop.recorded)))
-
-
 def _write_task(loop: LoopOfControl, model: Kalman, slopes: Singles, commands: Singles, folder: Path) -> None:
-    _save(folder / _CONTROL, loop, model)
-    save_arrays(folder / _TASK, {"slopes": slopes, "commands": commands})
+    (folder / _TASK).write_bytes(pickle.dumps((loop, model, slopes, commands)))
 
 
 def learn_beside(folder: str) -> None:
-    """Learn again from the frames in a folder, and write the controller to it if it is better."""
-    path = Path(folder)
-    control = PredictiveControl.load(path / _CONTROL)
-    frames = read_arrays(path / _TASK, "frames of a loop", ("slopes", "commands"))
+    """Learn again from the frames in a private folder, and write the result to it."""
+    loop, model, slopes, commands = pickle.loads((Path(folder) / _TASK).read_bytes())
+    control = PredictiveControl(loop, model)
     try:
-        better, text = control.better_of(control.recording_of(**frames))
+        better, text = control.better_of(control.recording_of(slopes, commands))
     except InputError as error:
         better, text = None, f"not learnt again: {error}"
-    if better is not None:
-        better.save(path / _BETTER)
-    (path / _RESULT).write_text(text, encoding="utf-8")
+    learnt = None if better is None else (better._loop, better.model)
+    (Path(folder) / _RESULT).write_bytes(pickle.dumps((learnt, text)))
 
 
 def _read_result(folder: Path) -> tuple[PredictiveControl | None, str]:
-    better = PredictiveControl.load(folder / _BETTER) if (folder / _BETTER).exists() else None
-    return better, (folder / _RESULT).read_text(encoding="utf-8")
+    learnt, text = pickle.loads((folder / _RESULT).read_bytes())
+    return (None if learnt is None else PredictiveControl(*learnt)), text
 
 
 def learn(recording: Recording, start: Identified | None = None) -> PredictiveControl:

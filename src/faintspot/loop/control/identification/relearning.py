@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import pickle
 import subprocess
 import sys
 import tempfile
@@ -17,7 +18,6 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.base.errors import InputError
 from faintspot.loop.control.base import OpenLoopTelemetry
 from faintspot.loop.control.identification.recording import Recording
 from faintspot.loop.control.reconstructor import make_reconstructor
@@ -87,7 +87,7 @@ class BesideTheLoop(Generic[Result]):
         self._thread.start()
 
     def _run(self) -> None:
-        with contextlib.suppress(OSError, InputError):  # then there is no result
+        with contextlib.suppress(OSError, EOFError, pickle.UnpicklingError):  # then there is no result
             self._work_in_process()
 
     def _work_in_process(self) -> None:
