@@ -78,7 +78,7 @@ class ForeignLoop(ABC):
     name: str
     cells: NDArray[np.int64]
     interaction: Floats
-    sign, is_slow, is_modal = 1.0, False, False
+    sign, is_changing, is_slow, is_modal = 1.0, False, False, False
     rate_hz: float
     subaperture_m: float
     unit_arcsec: float

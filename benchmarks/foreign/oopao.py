@@ -221,8 +221,6 @@ class OopaoLoop(SteppedLoop):
 class ChangingLoop(OopaoLoop):
     """Loop whose winds become faster by 1.6 and turn by 40 degrees after 700 frames, once they may."""
 
-    is_changing = False
-
     def paths_m(self, seed: int, frames: int) -> NDArray[np.float32]:
         """See `SteppedLoop`."""
         if not self.is_changing or frames <= CHANGED_AFTER:
