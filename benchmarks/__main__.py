@@ -47,6 +47,7 @@ _ORDER = (
     "layouts",
     "wavefronts",
     "metrology",
+    "beams",
     "yardstick",
     "startup",
     "loaded",
@@ -63,6 +64,7 @@ LONG = {
     "layouts",
     "wavefronts",
     "metrology",
+    "beams",
     "yardstick",
 }
 """Run only when named, or with --full: 5 minutes to an hour each, one with a recording of its own."""

@@ -83,7 +83,7 @@ def test_bright_spots_outside_all_windows_are_named() -> None:
     """Two ghosts far from the pupil are; a cosmic ray of one sharp track and a faint ghost are not."""
     truth = comatic(0.0, seed=3)
     ghosts = np.array([14.0 + 17.0j, 270.0 + 21.0j])
-    flux_e = np.concatenate([np.full(len(truth.spots), 4000.0), [4000.0, 4000.0, 300.0]])
+    flux_e = np.concatenate([np.full(len(truth.spots), 4000.0), [4000.0, 4000.0, 100.0]])
     at = np.concatenate([truth.spots, ghosts, [20 + 280j]])
     frame = spot_frame(at, truth.frame.shape, flux_e=flux_e, width_px=1.4)
     frame[275:277, 275:277] += 1500.0
@@ -146,3 +146,13 @@ def test_the_lattice_is_not_that_of_the_structure_in_the_spots(kind: str, geomet
     assert grid.geometry == geometry
     assert grid.pitch_px == pytest.approx(25.6, rel=0.02)
     assert abs(len(grid.cells) - count) <= 0.15 * count or grid.doubt
+
+
+def test_lit_spots_in_no_sub_aperture_are_counted() -> None:
+    """Two ghosts and the lenslets at the edge of the frame."""
+    truth = comatic(0.0, seed=3)
+    at = np.append(truth.spots, [14.0 + 17.0j, 270.0 + 21.0j])
+    frame = spot_frame(at, truth.frame.shape, flux_e=4000.0, width_px=1.4)
+    assert fs.Layout.from_frame(frame).spots_left_out == 2
+    cut = find_layout(frame[:, :-30])
+    assert cut.layout.spots_left_out == 2 + len(cut.cut) > 2

@@ -273,7 +273,8 @@ def command(
         notes.append(f"  the settings that {output} has are kept")
     marks: dict[str, Any] = {}
     if isinstance(found, FoundLayout):
-        marks = {"outside": found.outside, "doubtful": found.clipped | found.unlike}
+        left_out = np.concatenate([found.outside, found.cut])
+        marks = {"outside": left_out, "doubtful": found.clipped | found.unlike}
     if drawing is not None:
         from faintspot.slopes.recorded.layout_picture import layout_picture
 

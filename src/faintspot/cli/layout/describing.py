@@ -68,8 +68,11 @@ def _displaced_spots(found: FoundLayout) -> list[str]:
         depth = np.minimum(found.outside, size - 1 - found.outside).min(axis=1)
         at_edge = np.count_nonzero(depth < 0.5 * found.lenslets.pitch_px)
         where = f", {at_edge} of them at the frame's edge" if at_edge else ""
-        spots = "1 bright spot lies" if count == 1 else f"{count} bright spots lie"
-        lines.append(f"  {spots} outside all windows{where}: see the circles in the picture")
+        spots = "1 lit spot lies" if count == 1 else f"{count} lit spots lie"
+        lines.append(
+            f"  {spots} outside all windows{where}: see the circles in the picture; smaller "
+            "--illuminated-fraction takes dim lenslets"
+        )
     if (drift := np.linalg.norm(found.lenslets.drifts, axis=1).max()) > 0:
         lines.append(
             f"  the windows follow spots that lie up to {drift:.1f} px from the regular lattice, which stays "

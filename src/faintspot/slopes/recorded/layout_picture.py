@@ -46,7 +46,7 @@ def layout_picture(
     path : str or Path
         Replaced when it exists.
     outside : (m, 2) array
-        x, y of spots outside all windows, drawn as circles.
+        x, y of lit spots that are in no sub-aperture, drawn as circles.
     doubtful : (n_subapertures,) array of bool, optional
         Sub-apertures whose windows are drawn in another colour.
 

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial import cKDTree
 
 from faintspot.base.checks import number_between
 from faintspot.base.errors import InputError
@@ -18,9 +17,9 @@ from faintspot.slopes.sensor.detection.lenslets import LensletGrid
 from faintspot.slopes.sensor.layout import Layout
 from faintspot.slopes.sensor.region import LEAST_DIFFERENCE, PupilRegion, Rectangle, lines_of, neighbours_of
 from faintspot.slopes.sensor.window_checks import LARGEST_WINDOW, SMALLEST_WINDOW, window_size
-from faintspot.slopes.sensor.windows import Windows, find_windows
+from faintspot.slopes.sensor.windows import find_windows
 
-_GHOST, _DARK = 0.3, 0.25  # of the median flux of the neighbours, and of all
+_GHOST = 0.3  # of the median flux of the neighbours
 _EDGE_GHOST = 0.2  # of that of the neighbours at the edge of the pupil, where lenslets may be partly lit
 
 
@@ -37,7 +36,8 @@ class FoundLayout:
     cut : (n, 2) array
         x, y of the illuminated lenslets omitted because their window leaves the frame [px].
     outside : (n, 2) array
-        x, y of the bright spots outside all windows that belong to none of these lenslets [px].
+        x, y of the spots outside all windows that belong to none of these lenslets [px]: bright ones, and dim
+        ones whose position has a standard error below 0.1 px.
     clipped : (n_subapertures,) array of bool
         True where the spot is within its standard deviation (at least 1 px) of the edge of its window.
     unlike : (n_subapertures,) array of bool
@@ -88,33 +88,15 @@ def find_layout(frame: ArrayLike, **options: Any) -> FoundLayout:
     """
     found = find_windows(frame, **options)
     grid, within = found.lenslets, found.within
-    depth = _depth(found, grid.spots, np.arange(len(grid.spots)))[within]
+    depth = found.depth(grid.spots, np.arange(len(grid.spots)))[within]
     return FoundLayout(
         Layout.of_windows(found),
         grid,
         grid.centres[~within],
-        _outside(found),
+        found.outside,
         depth < max(grid.spot_px, 1.0),
         (_unlike(grid) | _dim(grid))[within],
     )
-
-
-def _depth(found: Windows, spots: NDArray[np.float64], of_window: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Return the distance [px] of each spot inside the edge of its window; negative outside."""
-    side = np.array(found.window[::-1])
-    from_first = spots - found.corners[of_window, ::-1] + 0.5
-    return np.asarray(np.minimum(from_first, side - from_first).min(axis=-1))
-
-
-def _outside(found: Windows) -> NDArray[np.float64]:
-    """Return the bright spots outside all windows, including windows cut by the edge of the frame."""
-    spots = found.lenslets.elsewhere
-    if len(spots) == 0:
-        return spots
-    middles = found.corners[:, ::-1] + 0.5 * (np.array(found.window[::-1]) - 1)
-    _, near = cKDTree(middles).query(spots, min(4, len(middles)), p=np.inf)
-    near = near.reshape(len(spots), -1)
-    return np.asarray(spots[(_depth(found, spots[:, None], near) < 0).all(axis=1)])
 
 
 def _unlike(grid: LensletGrid) -> NDArray[np.bool_]:
@@ -140,8 +122,7 @@ def _dim(grid: LensletGrid) -> NDArray[np.bool_]:
     is_edge = np.isnan(around).any(axis=1)
     around[np.isnan(around).all(axis=1)] = 0.0
     near = np.nanmedian(around, axis=1)
-    brightest = np.maximum(_GHOST * near, _DARK * np.median(grid.flux))
-    return np.asarray(grid.flux < np.where(is_edge, _EDGE_GHOST * near, brightest))
+    return np.asarray(grid.flux < np.where(is_edge, _EDGE_GHOST, _GHOST) * near)
 
 
 _LIT_FRACTION = 0.3

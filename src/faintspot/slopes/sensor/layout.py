@@ -38,8 +38,6 @@ _MOST_LENSLETS = 1 << 20
 _LARGEST_PX = 1e9
 LARGEST_BIN = 64
 """Largest `bin`."""
-
-
 _optics = partial(number, None, 0.0, _LARGEST_PX, low_open=True)
 
 
@@ -77,6 +75,8 @@ class Layout(ConfigurationTable, table="layout"):
         rotation.
     doubts : tuple of str
         What may be wrong with a layout found in a frame, one sentence each.
+    spots_left_out : int
+        Number of lit spots in the frame, measurable to 0.1 px, that are in no sub-aperture.
     bin : int
         Slopes are measured in sums of bin x bin pixels, for windows over 64 px and colour mosaics. All fields
         are in the camera's pixels; windows and corners are multiples of it.
@@ -110,6 +110,7 @@ class Layout(ConfigurationTable, table="layout"):
     diameter_m: float | None = _optics("Diameter of the telescope's pupil.", unit="m")
     fitted: tuple[str, ...] = setting((), kind=TEXTS)
     doubts: tuple[str, ...] = setting((), kind=TEXTS)
+    spots_left_out: int = number(0, 0, _MOST_LENSLETS, whole=True)
     bin: int = number(1, 1, LARGEST_BIN, whole=True)
 
     def __post_init__(self) -> None:
@@ -170,7 +171,7 @@ class Layout(ConfigurationTable, table="layout"):
         Parameters
         ----------
         chosen : (n,) array of bool, slice or list of int
-            Sub-apertures to select: a mask of all, or their numbers.
+            Mask of all sub-apertures, or numbers of those to select.
 
         Raises
         ------
@@ -298,23 +299,21 @@ class Layout(ConfigurationTable, table="layout"):
         pitch_px, angle_deg, centre, fit
             What is known of the lattice, and used as stated: see `faintspot.slopes.sensor.stated`.
         pixels : int or (int, int), optional
-            Window, or its height and width. Default: the largest square windows that do not overlap; a
-            pitch that is an integer within its error gives windows of that size.
+            Window, or its height and width. Default: the largest square windows that do not overlap.
         bad_pixels : (h, w) array of bool, optional
             True for pixels to ignore.
         move_windows : bool
-            Whether all windows may be shifted together, by up to 0.35 of their side, to include spots at
-            the edge of the frame. Centres of gravity are less accurate in such windows.
+            Whether all windows may be shifted, by up to 0.35 of their side, to include spots at the edge of
+            the frame. Centres of gravity are less accurate in such windows.
         **options
             Passed on to `faintspot.slopes.sensor.windows.find_windows`.
 
         Returns
         -------
         Layout
-            Illuminated sub-apertures whose windows are within the frame. Windows are centred on the mean
-            lattice of the spots, unless they were shifted or follow spots that an aberration moves by more
-            than a quarter of the pitch; `centres` always contain the lattice.
-            `faintspot.slopes.sensor.found_layout.find_layout` lists the omitted lenslets and spots.
+            Illuminated sub-apertures whose windows are within the frame. Windows are centred on the lattice
+            of the spots, unless shifted, or following spots moved by over a quarter of the pitch; `centres`
+            contain the lattice. `faintspot.slopes.sensor.found_layout.find_layout` lists the spots left out.
 
         Raises
         ------
@@ -347,6 +346,7 @@ class Layout(ConfigurationTable, table="layout"):
             grid.pitch_px,
             grid.angle_deg,
             fitted=found.fitted,
+            spots_left_out=int(np.count_nonzero(~within)) + len(found.outside),
         )
 
     @classmethod

@@ -45,6 +45,23 @@ class Windows:
     fitted: tuple[str, ...]
     """Parameters of the lattice that were fitted to the frame: "centre", "pitch", "angle"."""
 
+    def depth(self, spots: NDArray[np.float64], of_window: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Return the distance [px] of each spot inside the edge of its window; negative outside."""
+        side = np.array(self.window[::-1])
+        from_first = spots - self.corners[of_window, ::-1] + 0.5
+        return np.asarray(np.minimum(from_first, side - from_first).min(axis=-1))
+
+    @property
+    def outside(self) -> NDArray[np.float64]:
+        """Lit spots (m, 2) outside all windows, including windows cut by the edge of the frame."""
+        spots = self.lenslets.elsewhere
+        if len(spots) == 0:
+            return spots
+        middles = self.corners[:, ::-1] + 0.5 * (np.array(self.window[::-1]) - 1)
+        _, near = cKDTree(middles).query(spots, min(4, len(middles)), p=np.inf)
+        near = near.reshape(len(spots), -1)
+        return np.asarray(spots[(self.depth(spots[:, None], near) < 0).all(axis=1)])
+
 
 def find_windows(
     frame: ArrayLike,

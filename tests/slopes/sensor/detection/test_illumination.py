@@ -216,3 +216,46 @@ def test_region_of_interest() -> None:
 def test_bad_options(words: str, options: dict[str, Any]) -> None:
     with refused(words):
         find_lenslets(np.eye(50, 60), **options)
+
+
+def _beam(factor: float, cut: float = np.inf) -> tuple[Sensor, NDArray[np.bool_]]:
+    """Return a Gaussian beam that falls by a factor at the radius, dark beyond a cut, and its clear spots."""
+    truth = Sensor(7, lenslets=14, inner=0.0, scatter=0.0, outside=1.0)
+    offset = truth.nodes - (truth.size - 1) / 2 * (1 + 1j)
+    truth.flux_e = 40000.0 * factor ** -((np.abs(offset) / (7 * truth.pitch_px)) ** 2)
+    truth.flux_e[offset.real > cut * truth.pitch_px] = 0.0
+    edge = np.minimum.reduce([truth.nodes.real, truth.nodes.imag])
+    edge = np.minimum(edge, truth.size - 1 - np.maximum(truth.nodes.real, truth.nodes.imag))
+    truth.illuminated = truth.flux_e > 0
+    return truth, (edge > 4) & (truth.flux_e > 900.0)  # 900 e- in 1.4 px and 5.4 e- of noise: 0.06 px
+
+
+@pytest.mark.parametrize("cut", [np.inf, 3.0])
+@pytest.mark.parametrize("factor", [3.0, 30.0])
+def test_every_clear_spot_of_a_beam_is_taken(factor: float, cut: float) -> None:
+    truth, clear = _beam(factor, cut)
+    grid = find_lenslets(truth.frame())
+    found = grid.centres[:, 0] + 1j * grid.centres[:, 1]
+    assert np.abs(truth.nodes[clear, None] - found).min(axis=1).max() < 0.3 * truth.pitch_px
+    assert truth.wrong(grid)[1] == 0
+    assert grid.doubt == ""
+
+
+def test_clear_spots_below_the_illuminated_fraction_are_named() -> None:
+    truth, clear = _beam(30.0)
+    grid = find_lenslets(truth.frame(), illuminated_fraction=0.3)
+    at = np.concatenate([grid.spots, grid.elsewhere]) @ [1, 1j]
+    assert len(grid.spots) < 0.7 * np.count_nonzero(clear)
+    assert np.abs(truth.nodes[clear, None] - at).min(axis=1).max() < 0.3 * truth.pitch_px
+
+
+def test_dim_lenslets_at_the_edge_of_an_even_pupil_are_named() -> None:
+    truth = Sensor(3, lenslets=12, flux_e=20000.0)
+    edge = np.abs(truth.nodes[:, None] - truth.nodes[truth.illuminated]).min(axis=1) / truth.pitch_px
+    dim = np.flatnonzero((edge > 0.5) & (edge < 1.2) & (np.abs(truth.nodes - truth.nodes.mean()) > 100))[::3]
+    truth.flux_e[dim] = 1500.0
+    grid = find_lenslets(truth.frame())
+    assert truth.wrong(grid)[1] == 0
+    elsewhere = grid.elsewhere @ [1, 1j]
+    assert len(elsewhere) == len(dim)
+    assert np.abs(truth.nodes[dim, None] - elsewhere).min(axis=1).max() < 0.3 * truth.pitch_px

@@ -10,7 +10,12 @@ from numpy.typing import NDArray
 
 from faintspot.slopes.sensor.detection.acquisition import follow
 from faintspot.slopes.sensor.detection.candidates import Lattice, find_candidates
-from faintspot.slopes.sensor.detection.illumination import Illumination, find_illumination
+from faintspot.slopes.sensor.detection.illumination import (
+    LIKE,
+    Illumination,
+    find_illumination,
+    measurable,
+)
 from faintspot.slopes.sensor.detection.nodes import (
     Drift,
     NodeFlux,
@@ -46,8 +51,6 @@ _SPARE, _SPARE_PART = 3, 0.02
 _LARGEST_ERROR, _ERROR, _DISPLACED = 0.03, 0.015, 0.32
 # Fewest lit lenslets, and fewest pairs of neighbouring spots in each direction: one pair is a coincidence.
 FEWEST, _PAIRS = 4, 1.4
-# Minimum shape similarity: fraction of the squared flux explained, relative to illuminated spots.
-_LIKE = 0.6
 
 
 @dataclass(frozen=True)
@@ -55,7 +58,7 @@ class LatticeFit:
     """Lattice fitted to the spots, with measurements at its nodes and their illumination.
 
     `bright` are all spots as bright as the illuminated ones, `elsewhere` those of them at no
-    illuminated node.
+    illuminated node. `dim` are other measurable spots there.
     """
 
     lattice: Lattice
@@ -64,6 +67,7 @@ class LatticeFit:
     illuminated: Illumination
     bright: NDArray[np.complex128]
     elsewhere: NDArray[np.complex128]
+    dim: NDArray[np.complex128]
     shape: tuple[int, ...]
 
     @property
@@ -133,7 +137,9 @@ def best_fit(
         return None
     if pupil is not None:
         held = pupil.holds(best.lattice.positions(best.spots.cells))
-        return replace(best, illuminated=replace(best.illuminated, nodes=held, doubt=""))
+        beyond = best.spots.positions[best.illuminated.nodes & ~held]
+        illuminated = replace(best.illuminated, nodes=held, doubt="")
+        return replace(best, illuminated=illuminated, elsewhere=np.concatenate([best.elsewhere, beyond]))
     return replace(
         best, illuminated=replace(best.illuminated, doubt=_unclear(best) or best.illuminated.doubt)
     )
@@ -209,12 +215,27 @@ def _illuminated_of(
     """Decide which lenslets of a lattice are illuminated, and which bright spots belong to none of them."""
     spots = measure_nodes(image, lattice, width_px, drift)
     illuminated = find_illumination(spots, lattice, illuminated_fraction)
-    elsewhere = bright = np.empty(0, dtype=np.complex128)
-    if illuminated.nodes.any():
-        bright = everywhere.positions[_bright(everywhere, spots, illuminated)]
-        distance = as_tree(spots.positions[illuminated.nodes]).query(as_rows(bright))[0]
-        elsewhere = bright[distance > _ELSEWHERE * lattice.pitch_px]
-    return LatticeFit(lattice, width_px, spots, illuminated, bright, elsewhere, image.shape)
+    elsewhere = bright = dim = np.empty(0, dtype=np.complex128)
+    lit = illuminated.nodes
+    if lit.any():
+        is_bright = _bright(everywhere, spots, illuminated)
+        clear = is_bright | measurable(everywhere, spots, lit)
+        dark = spots.positions[~lit & measurable(spots, spots, lit)]
+        reach_px = _ELSEWHERE * lattice.pitch_px
+        bright, taken = everywhere.positions[is_bright], spots.positions[lit]
+        elsewhere = _away(bright, taken, reach_px)
+        dim = np.concatenate(
+            [everywhere.positions[clear & ~is_bright], _away(dark, everywhere.positions[clear], reach_px)]
+        )
+        dim = _away(dim, taken, reach_px)
+    return LatticeFit(lattice, width_px, spots, illuminated, bright, elsewhere, dim, image.shape)
+
+
+def _away(
+    at: NDArray[np.complex128], others: NDArray[np.complex128], reach_px: float
+) -> NDArray[np.complex128]:
+    """Return the positions that are farther than this from all others."""
+    return np.asarray(at[as_tree(others).query(as_rows(at))[0] > reach_px])
 
 
 def _bright(everywhere: SpotFlux, spots: NodeFlux, illuminated: Illumination) -> NDArray[np.bool_]:
@@ -224,5 +245,5 @@ def _bright(everywhere: SpotFlux, spots: NodeFlux, illuminated: Illumination) ->
     )
     # In the cells of a lattice that is too coarse, other spots count as noise.
     clear = everywhere.signal_to_noise > min(_CLEAR, 0.5 * ratio)
-    alike = everywhere.likeness > _LIKE * likeness
+    alike = everywhere.likeness > LIKE * likeness
     return np.asarray(clear & alike & (everywhere.flux >= illuminated.least_flux))

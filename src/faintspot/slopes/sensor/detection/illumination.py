@@ -9,7 +9,7 @@ evidence of a node is never overruled; a column of doubtful nodes is included or
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.sparse
@@ -18,7 +18,7 @@ from scipy.sparse.csgraph import breadth_first_order, connected_components, maxi
 
 from faintspot.base.statistics import MAD_TO_STD
 from faintspot.slopes.sensor.detection.candidates import Lattice
-from faintspot.slopes.sensor.detection.nodes import SEARCH, NodeFlux
+from faintspot.slopes.sensor.detection.nodes import SEARCH, NodeFlux, SpotFlux
 from faintspot.slopes.sensor.region import links_of
 
 # Signal-to-noise ratio at which a spot is as likely as not: the highest of the 10 to 20 independent noise
@@ -56,6 +56,13 @@ _CLOSE, _DOUBTFUL, _FAINT = 1.25, 0.15, 6.0
 # Peaks distributed over the search area have a median distance of 0.25 pitch from its centre; spots have
 # less.
 _SCATTERED = 0.2
+# The flux is that of a Gaussian beam if this explains so much of the variance of its logarithm, in so many
+# spots. Passes of its fit, least scatter of the logarithm, and outliers in units of it.
+_BEAM, _FEWEST_FOR_BEAM = 0.9, 12
+_FITS, _LEAST_SCATTER, _OUTLIER = 6, 0.05, 4.0
+# Standard error of a position [px] below which a spot is measurable: 0.1 px, and the error of the estimate.
+# Least fraction of the squared flux that the shape explains, relative to illuminated spots.
+_MEASURABLE_PX, LIKE = 0.14, 0.6
 # Share of dim lenslets among the illuminated ones above which there may be a second, dimmer set of spots.
 _DIM = 0.4
 _PASSES = 4
@@ -82,8 +89,66 @@ def find_illumination(spots: NodeFlux, lattice: Lattice, illuminated_fraction: f
     lattice : Lattice
     illuminated_fraction : float, optional
         Smallest flux of an illuminated lenslet (exclusive), relative to the median flux of those found
-        without it. Default: the value between 0.18 and 0.5 with the fewest lenslets near it.
+        without it. Default: the value between 0.18 and 0.5 with the fewest lenslets near it, relative to the
+        flux of a Gaussian beam if there is one: there, measurable spots are illuminated down to any flux.
     """
+    found = _even_illumination(spots, lattice, illuminated_fraction)
+    if illuminated_fraction is not None:
+        return found
+    for _ in range(_PASSES):
+        profile = _beam_profile(spots, found.nodes, lattice)
+        if profile is None:
+            break
+        clear, ratio = measurable(spots, spots, found.nodes), spots.signal_to_noise
+        even = replace(
+            spots,
+            flux=spots.flux / profile,
+            flux_noise=spots.flux_noise / profile,
+            signal_to_noise=np.where(clear, np.maximum(ratio, _BRIGHT), ratio),
+        )
+        relative = _even_illumination(even, lattice, None)
+        nodes = relative.nodes & (clear | found.nodes)
+        if not nodes.any() or np.array_equal(nodes, found.nodes):
+            return replace(found, doubt=relative.doubt)
+        found = replace(found, nodes=nodes, doubt=relative.doubt)
+    return found
+
+
+def measurable(spots: SpotFlux, nodes: NodeFlux, illuminated: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return which spots are measurable to 0.1 px, and have a shape like those of the illuminated nodes."""
+    likeness = float(np.median(nodes.likeness[illuminated]))
+    return np.asarray((spots.error_px < _MEASURABLE_PX) & (spots.likeness > LIKE * likeness))
+
+
+def _beam_profile(
+    spots: NodeFlux, illuminated: NDArray[np.bool_], lattice: Lattice
+) -> NDArray[np.float64] | None:
+    """Return the flux that a Gaussian beam has at each node, or None if the flux is not like that of one."""
+    if np.count_nonzero(illuminated) < _FEWEST_FOR_BEAM:
+        return None
+    at = lattice.positions(spots.cells)
+    at = (at - at[illuminated].mean()) / np.abs(at - at[illuminated].mean())[illuminated].max()
+    x, y = at.real, at.imag
+    terms = np.stack([np.ones(len(x)), x, y, x**2, x * y, y**2], axis=1)
+    used, logs = terms[illuminated], np.log(np.maximum(spots.flux[illuminated], 1e-300))
+    weights = np.ones(len(logs))
+    for _ in range(_FITS):
+        root = np.sqrt(weights)
+        numbers = np.linalg.lstsq(root[:, None] * used, root * logs, rcond=None)[0]
+        residual = logs - used @ numbers
+        scale = max(MAD_TO_STD * float(np.median(np.abs(residual))), _LEAST_SCATTER)
+        weights = np.maximum(1 - (residual / (_OUTLIER * scale)) ** 2, 0.0) ** 2
+    spread = np.average((logs - np.average(logs, weights=weights)) ** 2, weights=weights)
+    if np.average(residual**2, weights=weights) > (1 - _BEAM) * spread:
+        return None
+    curvature = np.array([[2 * numbers[3], numbers[4]], [numbers[4], 2 * numbers[5]]])
+    if np.linalg.eigvalsh(curvature).max() > 0:
+        return None
+    return np.asarray(np.exp(terms @ numbers))
+
+
+def _even_illumination(spots: NodeFlux, lattice: Lattice, illuminated_fraction: float | None) -> Illumination:
+    """Decide which nodes of an evenly illuminated pupil are illuminated."""
     detected = _detection(spots)
     certain = detected > 1
     if not certain.any():

@@ -168,7 +168,7 @@ def find_lenslets(
         drifts=as_rows(spots.drifts[illuminated.nodes]),
         spots=as_rows(spots.positions[illuminated.nodes] + corner),
         spot_px=fit.width_px,
-        elsewhere=as_rows(np.concatenate([fit.elsewhere, _lost_as_hot(raw, hot, fit)]) + corner),
+        elsewhere=as_rows(np.concatenate([fit.elsewhere, fit.dim, _lost_as_hot(raw, hot, fit)]) + corner),
         doubt=illuminated.doubt,
     )
 

@@ -60,6 +60,8 @@ class SpotFlux:
         Signal-to-noise ratio of the fitted spot, relative to the noise of its own cell.
     likeness : array
         Fraction of the squared flux explained by the spot shape: small for cosmic rays and hot pixels.
+    error_px : array
+        Standard error of the position along an axis: that of a Gaussian in the noise of its own cell.
     """
 
     positions: NDArray[np.complex128]
@@ -67,6 +69,7 @@ class SpotFlux:
     flux_noise: NDArray[np.float64]
     signal_to_noise: NDArray[np.float64]
     likeness: NDArray[np.float64]
+    error_px: NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -153,19 +156,21 @@ def _measured(
     residual = np.where(inside, values - numbers @ model.T, 0.0)
     # Use the noise of the background: for bright spots, residuals are dominated by the shape of the spot.
     weight = (1 - spot) ** 2
-    variance = (residual**2 @ weight) / np.maximum(inside @ weight, 1e-12)
-    variance += _coloured(image, band, lattice, width_px)
-    variance = np.maximum(variance, (1e-9 * float(np.ptp(image))) ** 2)
+    least = (1e-9 * float(np.ptp(image))) ** 2
+    white = np.maximum((residual**2 @ weight) / np.maximum(inside @ weight, 1e-12), least)
+    variance = white + _coloured(image, band, lattice, width_px)
     near = np.abs(offsets) <= max(1.5, min(2.5 * width_px, 0.5 * lattice.pitch_px))
     fitted = (numbers[:, 3:] * spot)[:, near]
     flux = (residual[:, near] + fitted).sum(axis=1)
     explained = (fitted**2).sum(axis=1)
+    height = np.maximum(numbers[:, 3], 1e-30)
     return SpotFlux(
         peaks + _subpixel(band, peaks),
         flux,
         np.sqrt(variance * np.count_nonzero(near)),
         numbers[:, 3] / np.sqrt(variance * inverse[:, 3, 3]),
         explained / np.maximum(explained + (residual[:, near] ** 2).sum(axis=1), 1e-300),
+        width_px * np.sqrt(2 * white * inverse[:, 3, 3]) / height,
     )
 
 
