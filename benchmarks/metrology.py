@@ -24,8 +24,8 @@ from faintspot.slopes.wavefront.zernike import mean_gradients, zernike
 
 Floats = NDArray[np.float64]
 
-MODES, PIXELS, READ_NOISE_E, FWHM_PX, POINTS = 14, 12, 2.0, 2.5, 201
-REFERENCE_FRAMES, SEED = 3, 27
+MODES, PIXELS, READ_NOISE_E, FWHM_PX, POINTS = 14, 12, 2.0, 2.5, 400
+REFERENCE_FRAMES, SEED = 3, 61
 OF_SLOPES, OF_FRAMES, DRAWS = 400, 60, 2000
 """Wavefronts of a case, and draws of a certificate (a fifth of the usual number)."""
 SIZES_PX = 0.0, 0.005, 0.02, 0.08, 0.3
@@ -141,7 +141,7 @@ def _modes_on_pupil(layout: fs.Layout) -> dict[str, Floats]:
 
     Those without tilt or focus are about the best plane or paraboloid.
     """
-    pupil, line = pupil_of(layout), np.linspace(-1.0, 1.0, POINTS)
+    pupil, line = pupil_of(layout), (np.arange(POINTS) + 0.5) * 2 / POINTS - 1
     outlines = (lenslet_outlines(layout) - pupil.centre_px) / pupil.radius_px
     grid = np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
     along = np.linspace(0.0, 1.0, 20)[:, None, None, None]

@@ -81,6 +81,14 @@ def test_errors_of_the_reference_count() -> None:
     assert certify(both).rms.standard_error > certify(own).rms.standard_error
 
 
+def test_reference_frames_that_scatter_little_by_chance_do_not_add_certainty() -> None:
+    """Three frames a tenth as noisy as their slopes tell: by Welch they would hardly count."""
+    own, other = noisy(LAYOUT, TRUE, 0.1, 1, 20), noisy(LAYOUT, 0 * TRUE, 0.1, 2, 3)
+    alike = other.mean + 0.1 * (other.coefficients - other.mean)
+    both = replace(own, subtracted=replace(other, coefficients=alike))
+    assert (both.degrees_of_freedom < 5).all()
+
+
 def test_what_is_not_known() -> None:
     found = certify(noisy(LAYOUT, TRUE, 0.1, 1))
     for estimate in (found.vergence_per_m, found.radius_of_curvature_m, found.strehl):

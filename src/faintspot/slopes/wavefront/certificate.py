@@ -20,7 +20,7 @@ from faintspot.slopes.wavefront.zernike import zernike
 
 Floats = NDArray[np.float64]
 
-_POINTS, _COARSE = 101, 71  # along the diameter, for the rms and for PV
+_POINTS, _COARSE = 200, 70  # along the diameter, for the rms and for PV
 _AROUND = 256  # points on the edge of the disk
 _ALONG = np.linspace(0.0, 1.0, 5)  # points on a side of a sub-aperture at the edge of the lit pupil
 _DRAWS, _PV_EVERY = 10_000, 10
@@ -138,7 +138,7 @@ def _with_tails(errors: Floats, direction: Floats, wavefront: Wavefront) -> Floa
 
     Its degrees of freedom are those of a sum of the modes' errors (Welch 1947, Biometrika 34, 28).
     """
-    parts = direction**2 * wavefront.mean_standard_error**2
+    parts = direction**2 * wavefront.variances
     squares = np.sum(parts**2 / wavefront.degrees_of_freedom)
     freedom = parts.sum() ** 2 / squares if squares > 0 else np.inf
     if not freedom < _AS_NORMAL:
@@ -150,7 +150,7 @@ def _with_tails(errors: Floats, direction: Floats, wavefront: Wavefront) -> Floa
 
 def _lit_points(wavefront: Wavefront, count: int, *, with_edge: bool = False) -> Floats:
     """Return points (p, 2) of a grid over the lit pupil, and perhaps of its edge."""
-    line = np.linspace(-1.0, 1.0, count)
+    line = (np.arange(count) + 0.5) * 2 / count - 1  # an edge on points would count too much
     points = np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
     if with_edge:
         angle = np.linspace(0.0, 2 * np.pi, _AROUND, endpoint=False)

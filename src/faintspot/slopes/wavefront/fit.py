@@ -112,15 +112,29 @@ class Wavefront:
 
     @property
     def degrees_of_freedom(self) -> Floats:
-        """Degrees of freedom of `mean_standard_error`, (k,); with a reference by Welch (1947)."""
+        """Degrees of freedom of `mean_standard_error`, (k,); with a reference by Welch (1947).
+
+        The variances that weigh both parts are at least those of the slopes' noise: where a scatter of few
+        frames is small by chance, it would count as better known than it is.
+        """
         frames = int(np.count_nonzero(self.fitted))
         own = np.full(len(self.modes), frames - 1.0 if frames > 1 else self.freedom)
         if self.subtracted is None:
             return own
-        parts = np.diag(self._own_covariance), np.diag(self.subtracted.mean_covariance)
+        parts = self._own_variances, self.subtracted.variances
         squares = parts[0] ** 2 / own + parts[1] ** 2 / self.subtracted.degrees_of_freedom
         both = (parts[0] + parts[1]) ** 2
         return np.asarray(np.divide(both, squares, out=np.full(len(own), np.inf), where=squares > 0))
+
+    @property
+    def variances(self) -> Floats:
+        """Variances of the mean, (k,), for degrees of freedom: not below those of the slopes' noise."""
+        return self._own_variances + (0.0 if self.subtracted is None else self.subtracted.variances)
+
+    @property
+    def _own_variances(self) -> Floats:
+        noise = np.diag(self.noise_covariance) / np.count_nonzero(self.fitted)
+        return np.asarray(np.fmax(np.diag(self._own_covariance), noise))
 
     @property
     def mean_half_width(self) -> Floats:
