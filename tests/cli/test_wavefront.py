@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from tests.cli.cli_cases import CONFIGURATION, Commands, simulated
+from tests.slopes.sensor.sensor_cases import spot_frame
 from tests.slopes.wavefront.test_fit import slopes_of
 
 from faintspot import Layout
@@ -204,3 +205,35 @@ def test_one_line_names_an_argument_that_cannot_be_used(run: Commands, slopes: P
         ((slopes, "--actuators", "mirror.npy", "--command", "c.txt"), ("c.txt", ".npy, .csv")),
     ):
         run.refused("wavefront", *arguments, naming=naming)
+
+
+@pytest.mark.parametrize("apart_px", [0.0, 3.44, 11.44])
+def test_layouts_of_their_own_give_the_same_modes(
+    run: Commands, folder: Path, no_picture: None, apart_px: float
+) -> None:
+    """A reference lights more lenslets, a part of a pitch or more away, over another offset and frame."""
+    row, column = np.mgrid[:7, :7].reshape(2, -1)
+    at = 8.0 * (column + 1) + 8.0j * (row + 1) + 1j
+    lit = np.abs(at - at[32]) < 20.0
+    moved = at + 0.02 * (at - at[32]) * lit + 0.3
+    for name, spots, size, offset in (
+        ("star", moved[lit], 66, 20.0),
+        ("flat", at + apart_px, 66 + round(apart_px), 300.0),
+    ):
+        frames = [
+            spot_frame(spots, (size, size), flux_e=20000.0, width_px=1.0, seed=seed, background_e=offset)
+            for seed in range(3)
+        ]
+        np.save(f"{name}.npy", np.array(frames))
+        run.ok("layout", f"{name}.npy", "-o", f"{name}.toml", "--pitch-px", 8)
+        run.ok("slopes", f"{name}.npy", "-c", f"{name}.toml", "-o", f"{name}.npz")
+    out = run.ok("wavefront", "star.npz", "--minus", "flat.npz", "--modes", 5, "-o", "w.json").out
+    mean = parse_json(Path("w.json").read_text())
+    radius = mean["pupil_radius_subapertures"]
+    tilt, _, focus, *others = (mode["mean"] for mode in mean["mean"]["modes"])
+    whole = (0.3 - apart_px - tilt * 2 / radius) / 8.0
+    assert whole == pytest.approx(round(whole), abs=0.01)
+    assert focus == pytest.approx(0.02 * 8.0 * radius**2 / (4 * np.sqrt(3)), abs=0.02)
+    np.testing.assert_allclose(others, 0.0, atol=0.02)
+    assert "px away" in out
+    assert mean["pupil_centre_px"] == pytest.approx([at[32].real, at[32].imag], abs=1.0)

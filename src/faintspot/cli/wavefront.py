@@ -17,7 +17,8 @@ from faintspot.cli.shared.output import picture_file, write_picture
 from faintspot.io.frames import read_array
 from faintspot.loop.control.flattening import Flattening, check_command_file, flattening, save_command
 from faintspot.slopes.pipeline.slopes import Slopes
-from faintspot.slopes.recorded.stored_run import StoredRun, difference, open_run
+from faintspot.slopes.recorded.differences import difference
+from faintspot.slopes.recorded.stored_run import StoredRun, open_run
 from faintspot.slopes.sensor.layout import OPTICS, Layout
 from faintspot.slopes.wavefront import Wavefront, certify, fit_drift, fit_wavefront, save_wavefront
 from faintspot.slopes.wavefront.files import (
@@ -113,7 +114,8 @@ def command(
     if minus is None:
         other = _reference(run, notes)
     else:
-        measured, other = difference(run, open_run(Path(minus)))
+        measured, other, about = difference(run, open_run(Path(minus)))
+        notes += about
     with errors_of_options(slopes):
         wavefront = fit_wavefront(measured, layout, modes=modes)
     if other is not None:

@@ -454,7 +454,11 @@ def _reference_positions(reference: ArrayLike | Slopes | None, layout: Layout) -
     if array.shape == (2 * n,):
         return np.stack([array[:n], array[n:]], axis=1)
     if array.shape != (n, 2):
-        raise InputError(f"expected shape ({n}, 2) or ({2 * n},), got {array.shape}", name="reference")
+        raise InputError(
+            f"expected shape ({n}, 2) or ({2 * n},), as the layout, got {array.shape}; `faintspot wavefront "
+            "--minus` subtracts slopes of another layout",
+            name="reference",
+        )
     return array
 
 

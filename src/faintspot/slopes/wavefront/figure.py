@@ -37,9 +37,11 @@ def wavefront_figure(
     panels = [_coefficients(wavefront, slice(0, 2), several, share)]
     if higher:
         panels.append(_coefficients(wavefront, slice(2, None), several, 2 - share))
+    x, y = wavefront.pupil.centre_px
     caption = (
-        f"{subject.capitalize()} over the lit pupil, in the frame's directions, with the illuminated "
-        "sub-apertures outlined; it increases in the direction in which spots are displaced. Below: its "
+        f"{subject.capitalize()} over the lit pupil, in the frame's directions, with the sub-apertures and "
+        f"the disk of the modes outlined (centre {x:.1f}, {y:.1f} px, radius {wavefront.pupil.radius_px:.1f} "
+        "px); it increases in the direction in which spots are displaced. Below: its "
         "coefficients ± standard error, with the names of the modes and their indices (Noll | OSA/ANSI)"
         + (", and in grey the rms of each over the frames (motion and noise)." if several else ".")
     )
