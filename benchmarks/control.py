@@ -35,7 +35,7 @@ from faintspot.loop.control.kalman.predictor import SlopeModel, SlopePredictor
 from faintspot.loop.control.reconstructor import Reconstructor
 from faintspot.loop.simulation import load_loop
 from faintspot.loop.simulation.record import slope_turbulence
-from faintspot.loop.simulation.telescope.model import prepare
+from faintspot.loop.simulation.telescope import prepare
 
 _NOISE_PX = 0.5
 _SIZES = (72, 54), (160, 97), (640, 400)

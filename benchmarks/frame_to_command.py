@@ -34,10 +34,10 @@ import faintspot as fs
 from benchmarks import pyrtc
 from benchmarks.control import random_filter
 from benchmarks.measuring import Row, Table
+from faintspot.engine.child_processes import real_time
 from faintspot.engine.engine import Engine
 from faintspot.engine.path.timing import Latencies
 from faintspot.engine.pixels.pixel_ring import PixelRing
-from faintspot.engine.requests.child_processes import real_time
 from faintspot.engine.settings.plan import EngineOptions
 from faintspot.loop.control import integrator
 from faintspot.loop.control.base import CommandDelayLine, Controller

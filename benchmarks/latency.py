@@ -26,9 +26,9 @@ from numpy.typing import NDArray
 from benchmarks.measuring import Row, Table, spread
 from benchmarks.rivals import problem
 from benchmarks.scale import settings, settings_in_words
+from faintspot.engine.child_processes import real_time
 from faintspot.engine.path.frame_path import FramePath, Progress
 from faintspot.engine.path.workers import Workers
-from faintspot.engine.requests.child_processes import real_time
 from faintspot.slopes.kernels.parallel import available_cpus
 
 FRAMES = {36: 40_000, 1208: 5_000}

@@ -19,10 +19,9 @@ from benchmarks.measuring import Row, Table, absolute_spread, best, interleaved,
 from faintspot.loop.control.base import CommandDelayLine
 from faintspot.loop.control.integrator import Integrator
 from faintspot.loop.simulation import LoopConfiguration, Method, load_loop, simulate_loop
-from faintspot.loop.simulation.telescope.atmosphere import MovingLayers, make_atmosphere
-from faintspot.loop.simulation.telescope.calibration import make_detector, make_pipeline
-from faintspot.loop.simulation.telescope.mirror import pupil_grid, require_hcipy
-from faintspot.loop.simulation.telescope.model import LoopOptics, prepare
+from faintspot.loop.simulation.atmosphere import MovingLayers, make_atmosphere
+from faintspot.loop.simulation.telescope import LoopOptics, make_detector, make_pipeline, prepare
+from faintspot.loop.simulation.wavefront_sensor import pupil_grid, require_hcipy
 
 TARGET_FRAMES_PER_S = 80.0
 FRAMES = 400

@@ -17,7 +17,6 @@ from benchmarks.results import PAGES, origin_now, publish_tables
 from faintspot.base.report.texts import in_hours, with_error
 from faintspot.base.statistics import Estimate
 from faintspot.experiments.night.analysis import Difference, by_strength, differences
-from faintspot.experiments.night.blocks import NIGHT_STORE, Night, load_night
 from faintspot.experiments.night.page import paper_sentences
 from faintspot.experiments.night.paper import (
     PAPER_MEANS,
@@ -27,7 +26,8 @@ from faintspot.experiments.night.paper import (
     paper_exposures,
     set_columns,
 )
-from faintspot.experiments.paper.whole import paper_rows
+from faintspot.experiments.night.protocol import NIGHT_STORE, Night, load_night
+from faintspot.experiments.paper.claims import paper_rows
 
 Tables = dict[str, dict[str, Any]]
 _FOLDER = click.Path(exists=True, file_okay=False, path_type=Path)

@@ -34,11 +34,10 @@ from faintspot.loop.control.identification.model import Kalman
 from faintspot.loop.control.identification.vibrations import Vibration
 from faintspot.loop.control.integrator import LoopPlant
 from faintspot.loop.simulation import LoopConfiguration, Method, load_loop
+from faintspot.loop.simulation.atmosphere import MovingLayers
 from faintspot.loop.simulation.record import slope_turbulence
 from faintspot.loop.simulation.simulation import measure_gains
-from faintspot.loop.simulation.telescope.atmosphere import MovingLayers
-from faintspot.loop.simulation.telescope.calibration import make_pipeline
-from faintspot.loop.simulation.telescope.model import TelescopeModel, prepare
+from faintspot.loop.simulation.telescope import TelescopeModel, make_pipeline, prepare
 from faintspot.loop.turbulence.slope_covariance import SlopeTurbulence
 from faintspot.slopes.pipeline.settings import Settings
 

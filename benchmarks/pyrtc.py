@@ -51,7 +51,7 @@ from benchmarks.measuring import (
     spread,
 )
 from faintspot.engine.path.frame_path import FramePath, Progress
-from faintspot.engine.requests.requests import request, socket_path
+from faintspot.engine.requests import request, socket_path
 
 SIDE, PIXELS, LEVEL_ADU, RATE_HZ = 6, 16, 100, 300.0
 ROUNDS, FRAMES_A_ROUND, BATCH = 8, 300, 64

@@ -12,13 +12,12 @@ from dataclasses import replace
 import numpy as np
 
 from benchmarks.measuring import Row, Table
-from faintspot.engine.loop.control_loop import ControlLoop
+from faintspot.engine.control_loop import ControlLoop
 from faintspot.loop.control.configuration import Control
 from faintspot.loop.control.options import ControlOptions
 from faintspot.loop.simulation import Method, load_loop
 from faintspot.loop.simulation.simulation import measure_gains
-from faintspot.loop.simulation.telescope.calibration import make_pipeline
-from faintspot.loop.simulation.telescope.model import TelescopeModel
+from faintspot.loop.simulation.telescope import TelescopeModel, make_pipeline
 from faintspot.slopes.pipeline.settings import Settings
 from faintspot.slopes.pipeline.slopes import Slopes
 

@@ -35,7 +35,7 @@ from faintspot.loop.control.options import ControlOptions
 from faintspot.loop.simulation import LoopConfiguration, Method, load_loop, simulate_loop
 from faintspot.loop.simulation.engine_files import write_engine_files
 from faintspot.loop.simulation.record import slope_turbulence
-from faintspot.loop.simulation.telescope.model import prepare
+from faintspot.loop.simulation.telescope import prepare
 from faintspot.slopes.pipeline import configuration as configuration_file
 
 FRAMES, COMMANDS = 2000, 66

@@ -16,8 +16,7 @@ from faintspot.loop.control.identification.vibrations import Vibration
 from faintspot.loop.control.integrator import Integrator
 from faintspot.loop.simulation import LoopConfiguration, Method, load_loop
 from faintspot.loop.simulation.simulation import measure_gains
-from faintspot.loop.simulation.telescope.calibration import make_pipeline
-from faintspot.loop.simulation.telescope.model import TelescopeModel
+from faintspot.loop.simulation.telescope import TelescopeModel, make_pipeline
 from faintspot.loop.turbulence.slope_covariance import ARCSEC
 from faintspot.slopes.pipeline.settings import Settings
 

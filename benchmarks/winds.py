@@ -14,7 +14,7 @@ import numpy as np
 from benchmarks.measuring import Row, Table
 from benchmarks.prediction import SETTLE, VIBRATION_NM, Case, Floats, Run
 from faintspot.base.statistics import paired_mean
-from faintspot.engine.loop.guard import ControllerSuccessor, PreparedController
+from faintspot.engine.guard import ControllerSuccessor, PreparedController
 from faintspot.loop.control.base import ASSUMED, WINDS, CommandDelayLine, Controller
 from faintspot.loop.control.identification.learning import RelearntControl, relearn
 from faintspot.loop.control.identification.model import Kalman

@@ -17,7 +17,7 @@ from sphinx.util.docutils import SphinxTranslator
 from sphinx_gallery.scrapers import figure_rst
 from sphinx_gallery.sorting import FileNameSortKey
 
-from faintspot.cli import group, module_of
+from faintspot.cli import group, home_of
 from faintspot.loop.control.options import ControlOptions
 from faintspot.slopes.estimators.registry import all_tables, option_table
 from faintspot.slopes.pipeline.settings import SharedOptions
@@ -146,7 +146,7 @@ def _write_command_pages(app: Sphinx) -> None:
     folder = HERE / "reference/commands"
     folder.mkdir(exist_ok=True)
     for name in group.list_commands(click.Context(group)):
-        directive = f".. click:: {module_of(name)}:command\n   :prog: faintspot {name}\n   :nested: full\n"
+        directive = f".. click:: {home_of(name)}\n   :prog: faintspot {name}\n   :nested: full\n"
         text = f"```{{eval-rst}}\n{directive}```\n"
         page = folder / f"{name}.md"
         if not page.exists() or page.read_text(encoding="utf-8") != text:

@@ -25,12 +25,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse.linalg import eigsh
 
-from faintspot.experiments.closed_loop.methods import with_choice
+from faintspot.experiments.closed_loop.results import with_choice
 from faintspot.loop.control.kalman.predictor import SlopePredictor
 from faintspot.loop.simulation import LoopConfiguration, Method, load_loop, simulate_loop
 from faintspot.loop.simulation.learning import learnt_control
 from faintspot.loop.simulation.simulation import _Loop
-from faintspot.loop.simulation.telescope.model import LoopOptics, TelescopeModel, prepare
+from faintspot.loop.simulation.telescope import LoopOptics, TelescopeModel, prepare
 from faintspot.loop.turbulence.slope_covariance import phase_covariance_rad2
 
 Floats = NDArray[np.float64]

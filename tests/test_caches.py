@@ -34,13 +34,13 @@ OF_THE_PROGRAM = {
 
 OF_DATA = {
     "loop/control/identification/slope_spectra.py _table": 44,
-    "loop/simulation/learning.py _learnt": 4,
-    "loop/simulation/learning.py _telemetry": 1,
+    "loop/simulation/engine_files.py _learnt": 4,
+    "loop/simulation/engine_files.py _telemetry": 1,
     "loop/simulation/simulation.py _learnt_sodium": 4,
     "loop/simulation/simulation.py _typical_spots": 2,
-    "loop/simulation/telescope/model.py _laser_source": 2,
-    "loop/simulation/telescope/model.py _prepared": 2,
-    "loop/simulation/telescope/model.py atmosphere_of": 2,
+    "loop/simulation/telescope.py _laser_source": 2,
+    "loop/simulation/telescope.py _prepared": 2,
+    "loop/simulation/telescope.py atmosphere_of": 2,
     "loop/turbulence/slope_covariance.py _structure": 4,
     "loop/turbulence/strength.py _theory": 4,
     "slopes/spots/bounds.py _information_table": 64,

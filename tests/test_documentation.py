@@ -16,9 +16,9 @@ import pytest
 from tests.simulated import frames_of
 
 import faintspot as fs
+from faintspot.engine.telemetry.recorder import TelemetryStore
 from faintspot.engine.telemetry.ring import image_type, layout_values, record_type
 from faintspot.io import read_telemetry, write_aot
-from faintspot.io.telemetry.writing import TelemetryStore
 from faintspot.slopes.estimators import estimators, registry
 
 ROOT = Path(__file__).resolve().parents[1]

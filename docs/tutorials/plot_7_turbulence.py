@@ -25,7 +25,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from faintspot.loop.simulation import load_loop
-from faintspot.loop.simulation.telescope.model import TelescopeModel
+from faintspot.loop.simulation.telescope import TelescopeModel
 from faintspot.slopes.simulate import Detector
 
 RATE_HZ, FRAMES = 250.0, 3000

@@ -21,7 +21,7 @@ from faintspot.base.flags import UNMEASURED
 from faintspot.slopes.camera.calibration import Calibration
 from faintspot.slopes.estimators.base import Estimator, Need
 from faintspot.slopes.estimators.registry import estimator_named
-from faintspot.slopes.estimators.scene import Scene
+from faintspot.slopes.estimators.sensor import Scene
 from faintspot.slopes.pipeline.settings import Settings
 from faintspot.slopes.pipeline.slope_pipeline import SlopePipeline
 from faintspot.slopes.pipeline.slopes import Slopes

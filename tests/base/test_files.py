@@ -17,7 +17,7 @@ from faintspot.base.files import MOST_NUMBERS, check_size
 from faintspot.experiments.study.specification import StudySpecification
 from faintspot.experiments.study.sweep import Sweep
 from faintspot.io import open_frames
-from faintspot.loop.simulation.configuration.configuration import LoopConfiguration
+from faintspot.loop.simulation.configuration import LoopConfiguration
 from faintspot.slopes.spots.psf import PSF
 
 

@@ -2,15 +2,15 @@
 
 import subprocess
 import sys
-from importlib import import_module
 from pathlib import Path
 
+import click
 import numba
 import pytest
 from tests.cli.cli_cases import Commands, command_line
 
 import faintspot
-from faintspot.cli import module_of
+from faintspot.cli import group
 
 pytestmark = pytest.mark.slow
 
@@ -40,7 +40,9 @@ def test_help_lists_every_command(run: Commands) -> None:
 
 def test_every_option_says_what_it_is_for(run: Commands) -> None:
     for command in COMMANDS:
-        for parameter in import_module(module_of(command)).command.params:
+        found = group.get_command(click.Context(group), command)
+        assert found is not None
+        for parameter in found.params:
             assert parameter.param_type_name == "argument" or parameter.help, parameter.name
 
 

@@ -2,7 +2,9 @@
 
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,9 +16,8 @@ from faintspot.io import read_slopes
 fits = pytest.importorskip("astropy.io.fits")
 zarr = pytest.importorskip("zarr")
 
-pytestmark = pytest.mark.slow
 
-
+@pytest.mark.slow
 def test_frames_in(folder: Path, run: Commands) -> None:
     frames = simulated()
     fits.PrimaryHDU(frames).writeto(folder / "a.fits.gz")
@@ -26,6 +27,7 @@ def test_frames_in(folder: Path, run: Commands) -> None:
     assert result.out.splitlines()[-1] == "Next: faintspot report slopes.zarr"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["s.zarr", "s.fits", "s.fits.gz", "s.npz", "s.csv", "with space.npz"])
 def test_formats_out(folder: Path, run: Commands, name: str) -> None:
     frames = simulated()
@@ -38,6 +40,7 @@ def test_formats_out(folder: Path, run: Commands, name: str) -> None:
     assert sorted(path.name for path in folder.iterdir()) == sorted(["a.npy", "faintspot.toml", name])
 
 
+@pytest.mark.slow
 def test_key(folder: Path, run: Commands) -> None:
     frames = simulated()
     np.savez("a.npz", night=frames, dark=frames[:3])
@@ -49,6 +52,7 @@ def test_key(folder: Path, run: Commands) -> None:
         assert_equal(folder / name, expected(frames))
 
 
+@pytest.mark.slow
 def test_no_denoise_is_the_other_method(folder: Path, run: Commands) -> None:
     frames = simulated()
     np.save("a.npy", frames)
@@ -57,6 +61,7 @@ def test_no_denoise_is_the_other_method(folder: Path, run: Commands) -> None:
     assert read_slopes(folder / "s.npz").variables["iterations"].max() == 0
 
 
+@pytest.mark.slow
 def test_preset_goes_before_the_configuration(folder: Path, run: Commands) -> None:
     frames = simulated()
     np.save("a.npy", frames)
@@ -68,6 +73,7 @@ def test_preset_goes_before_the_configuration(folder: Path, run: Commands) -> No
     assert_equal(folder / "t.npz", expected(frames))
 
 
+@pytest.mark.slow
 def test_reference(folder: Path, run: Commands) -> None:
     frames = simulated()
     reference = np.random.default_rng(4).normal(0, 0.3, (16, 2))
@@ -79,6 +85,7 @@ def test_reference(folder: Path, run: Commands) -> None:
     run.refused("slopes", "a.npy", "-o", "t.npz", "--reference", "r.npz:other", naming=("(16, 2)", "(3, 2)"))
 
 
+@pytest.mark.slow
 def test_the_bar_is_one_line_on_standard_error(folder: Path, run: Commands) -> None:
     np.save("a.npy", simulated())
     result = run.ok("slopes", "a.npy", "--block", 3)
@@ -88,6 +95,7 @@ def test_the_bar_is_one_line_on_standard_error(folder: Path, run: Commands) -> N
     assert not any(character in result.out + result.err for character in "\r\x1b")
 
 
+@pytest.mark.slow
 def test_again_is_complete_already_and_overwrite_makes_it_anew(folder: Path, run: Commands) -> None:
     np.save("a.npy", simulated())
     run.ok("slopes", "a.npy")
@@ -100,6 +108,7 @@ def test_again_is_complete_already_and_overwrite_makes_it_anew(folder: Path, run
     assert_equal(folder / "slopes.zarr", expected(simulated(seed=2)))
 
 
+@pytest.mark.slow
 def test_bad_frames_are_flagged_and_counted(folder: Path, run: Commands) -> None:
     frames = simulated().astype(np.float32)
     frames[3] = np.nan
@@ -119,6 +128,7 @@ def test_bad_frames_are_flagged_and_counted(folder: Path, run: Commands) -> None
         assert line in result.out.splitlines(), result.out
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="needs /proc")
 def test_memory_is_bounded(folder: Path) -> None:
     """A sparse cube of 1.07 GB within 700 MB, once the kernels are compiled: the second run counts.
@@ -143,6 +153,7 @@ def test_memory_is_bounded(folder: Path) -> None:
     assert 1024 * largest_kb < 700_000_000
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["a.zarr", "a.fits", "a.npz", "a.csv"])
 def test_slopes_in_arcsec(folder: Path, run: Commands, name: str) -> None:
     scaled = "[layout]\npixel_scale_arcsec = 0.25\n[layout.grid]"
@@ -163,12 +174,14 @@ def test_slopes_in_arcsec(folder: Path, run: Commands, name: str) -> None:
     run.refused("slopes", "frames.npy", "-o", name, naming=(name, "another run"))
 
 
+@pytest.mark.slow
 def test_arcsec_need_a_scale(folder: Path, run: Commands) -> None:
     np.save("frames.npy", simulated(3))
     run.refused("slopes", "frames.npy", "--unit", "arcsec", naming=("unit", "pixel_scale_arcsec"))
     assert not Path("slopes.zarr").exists()
 
 
+@pytest.mark.slow
 def test_without_zarr_the_command_says_that_it_cannot_resume(
     folder: Path, run: Commands, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -178,3 +191,98 @@ def test_without_zarr_the_command_says_that_it_cannot_resume(
     assert result.err.splitlines()[0].startswith("s.npz: without zarr an interrupted run starts again")
     assert_equal(folder / "s.npz", expected(simulated()))
     run.refused("slopes", "a.npy", naming=("zarr", "faintspot[io]", "-o slopes.npz"))
+
+
+pytest.importorskip("zarr")
+
+
+def half_of_a_compressed_file(path: Path) -> None:
+    fits.PrimaryHDU(simulated()).writeto(path)
+    whole = path.read_bytes()
+    path.write_bytes(whole[: len(whole) // 2])
+
+
+# Those of the readers of frames and of the configuration have their own tests; here is one of each kind.
+BAD_FRAMES: list[tuple[str, Callable[[Path], Any], tuple[str, ...]]] = [
+    ("missing.fits", lambda path: None, ("no such file",)),
+    ("*.fits", lambda path: None, ("no such file",)),
+    ("text.fits", lambda path: path.write_text("x, y\n1, 2\n"), ("FITS",)),
+    ("half.fits.gz", half_of_a_compressed_file, ("frames", "damaged or incomplete")),
+    ("large.npy", lambda path: np.save(path, np.ones((3, 33, 32))), ("33 x 32", "32 x 32", "faintspot.toml")),
+]
+
+
+@pytest.mark.parametrize(("name", "make", "naming"), BAD_FRAMES, ids=[case[0] for case in BAD_FRAMES])
+@pytest.mark.parametrize("output", ["s.zarr", "s.npz"])
+def test_bad_frames(
+    folder: Path, run: Commands, name: str, make: Any, naming: tuple[str, ...], output: str
+) -> None:
+    make(folder / name)
+    run.refused("slopes", name, "-o", output, naming=(name, *naming))
+    if output == "s.npz" or not name.endswith("fits.gz"):
+        assert not (folder / output).exists()
+    else:  # a compressed file is found to be damaged only on the way
+        assert not read_slopes(folder / output).complete
+
+
+@pytest.mark.parametrize(
+    ("text", "naming"),
+    [
+        ("not toml at all", ("not a TOML file", "line 1")),
+        ("[estimator]\nname = 'tv'\nnoise_std = 2.0", ("[layout]", "estimator")),
+        (CONFIGURATION.replace("= 10", "= 64"), ("keep_brightest", "64", "63")),
+        (CONFIGURATION + '[calibration]\ndark = "dark.fits"', ("calibration.dark", "no such file")),
+    ],
+)
+def test_bad_configuration(folder: Path, run: Commands, text: str, naming: tuple[str, ...]) -> None:
+    np.save("a.npy", simulated())
+    (folder / "faintspot.toml").write_text(text)
+    run.refused("slopes", "a.npy", naming=("faintspot.toml", *naming))
+    assert not (folder / "slopes.zarr").exists()
+
+
+def test_no_configuration(folder: Path, run: Commands) -> None:
+    np.save("a.npy", simulated())
+    run.refused("slopes", "a.npy", "-c", "nix.toml", naming=("nix.toml", "no such file", "faintspot layout"))
+
+
+def test_bad_output(folder: Path, run: Commands) -> None:
+    np.save("a.npy", simulated())
+    run.refused("slopes", "a.npy", "-o", "s.xyz", naming=("s.xyz", ".zarr", ".csv"))
+    run.refused("slopes", "a.npy", "-o", "nix/s.npz", naming=("nix/s.npz", "folder nix does not exist"))
+    run.refused("slopes", "a.npy", "-o", "a.npy/s.npz", naming=("a.npy", "does not exist"))
+    run.refused("slopes", "a.npy", "-o", "", naming=("expected a name",))
+    run.ok("slopes", "a.npy", "-o", "s.csv")
+    run.refused("slopes", "a.npy", "-o", "s.csv", naming=("s.csv", "already exists", "--overwrite"))
+
+
+@pytest.mark.parametrize("output", ["s.zarr", "s.npz", "s.fits"])
+def test_output_of_another_run(folder: Path, run: Commands, output: str) -> None:
+    np.save("a.npy", simulated())
+    run.ok("slopes", "a.npy", "-o", output)
+    run.refused("slopes", "a.npy", "-o", output, "--no-denoise", naming=(output, "another run"))
+    assert_equal(folder / output, expected(simulated()))
+
+
+@pytest.mark.parametrize("name", ["s.npz", "s.npz:frames"])
+def test_frames_are_never_replaced_by_their_slopes(folder: Path, run: Commands, name: str) -> None:
+    np.savez("s.npz", frames=simulated())
+    before = (folder / "s.npz").read_bytes()
+    run.refused("slopes", name, "-o", "s.npz", "--overwrite", naming=("s.npz", "frames"))
+    assert (folder / "s.npz").read_bytes() == before
+
+
+def test_foreign_directory_is_never_replaced(folder: Path, run: Commands) -> None:
+    np.save("a.npy", simulated())
+    (folder / "s.zarr").mkdir()
+    (folder / "s.zarr" / "precious").touch()
+    run.refused("slopes", "a.npy", "-o", "s.zarr", "--overwrite", naming=("s.zarr", "expected slopes"))
+    assert (folder / "s.zarr" / "precious").exists()
+
+
+@pytest.mark.parametrize("reference", [np.ones((16, 3)), np.full((16, 2), np.nan)])
+def test_bad_reference(folder: Path, run: Commands, reference: Any) -> None:
+    np.save("a.npy", simulated())
+    np.save("r.npy", reference)
+    run.refused("slopes", "a.npy", "--reference", "r.npy", naming=("r.npy", "reference"))
+    run.refused("slopes", "a.npy", "--reference", "nix.npy", naming=("nix.npy", "no such file"))

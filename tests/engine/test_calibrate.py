@@ -12,8 +12,8 @@ import pytest
 from click.testing import CliRunner, Result
 
 from faintspot.base.errors import InputError
-from faintspot.cli.realtime.calibrate import calibrate
-from faintspot.engine.loop.poking import StreamedMirror
+from faintspot.cli.realtime.learn import calibrate
+from faintspot.engine.poking import StreamedMirror
 from faintspot.loop.control import mirror_calibration
 from faintspot.loop.control.configuration import Control, load_control, save_control
 

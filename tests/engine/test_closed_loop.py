@@ -12,11 +12,11 @@ import pytest
 
 from faintspot.base.errors import InputError
 from faintspot.engine.request_handlers import commands_of, loop_command
-from faintspot.engine.requests.requests import request, socket_path
+from faintspot.engine.requests import request, socket_path
 from faintspot.loop.control.configuration import Control
 from faintspot.loop.control.integrator import CompiledIntegrator
 from faintspot.loop.simulation import Method, simulate_loop
-from faintspot.loop.simulation.telescope.model import TelescopeModel
+from faintspot.loop.simulation.telescope import TelescopeModel
 from faintspot.slopes.pipeline import configuration as configuration_file
 
 pytest.importorskip("hcipy")

@@ -14,7 +14,7 @@ from tests.patience import LIMIT_S, wait_for
 
 import faintspot as fs
 from faintspot.engine.pixels.pixel_ring import PixelRing
-from faintspot.engine.requests.requests import socket_path
+from faintspot.engine.requests import socket_path
 
 pyshmem = pytest.importorskip("pyshmem")
 

@@ -10,8 +10,8 @@ import pytest
 import faintspot as fs
 from faintspot.engine.settings.interleaving import Interleaving
 from faintspot.engine.telemetry.recorder import Recorder
-from faintspot.experiments.night.measured_strehl import MeasuredStrehl
 from faintspot.experiments.night.recorded import recorded_night
+from faintspot.experiments.night.recorded_methods import MeasuredStrehl
 from faintspot.loop.simulation import Method, simulate_loop
 
 pytest.importorskip("hcipy")

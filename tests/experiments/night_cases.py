@@ -5,8 +5,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.experiments.night.blocks import Night
-from faintspot.experiments.night.protocol import NightPlan, label_of
+from faintspot.experiments.night.protocol import Night, NightPlan, label_of
 
 PLAN = NightPlan(strengths=(4, 6, 4, 6), repeats=(4, 2, 4, 2), gap_frames=0)
 BLOCK_S = 600 / 250  # s, a block with its settling

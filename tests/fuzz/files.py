@@ -19,7 +19,7 @@ from faintspot.experiments.study.specification import StudySpecification
 from faintspot.io import open_frames, read_array, read_slopes
 from faintspot.io.formats.registry import frame_format
 from faintspot.io.slopes import read_reference
-from faintspot.loop.simulation.configuration.configuration import LoopConfiguration, load_loop
+from faintspot.loop.simulation.configuration import LoopConfiguration, load_loop
 from faintspot.slopes.pipeline import configuration
 from faintspot.slopes.spots.psf import PSF
 
@@ -139,8 +139,8 @@ def _originals() -> Path:
     from tests.io import frame_files, idl_file, slope_files, telemetry_files
     from tests.io.formats.test_fits_files import table
 
+    from faintspot.engine.telemetry.recorder import TelemetryStore
     from faintspot.io import read_telemetry, write_aot
-    from faintspot.io.telemetry.writing import TelemetryStore
 
     keep = tempfile.TemporaryDirectory()
     _kept.append(keep)

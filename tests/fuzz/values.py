@@ -14,13 +14,13 @@ import numpy as np
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays_of
-from tests.engine.loop.test_control_loop import any_control
+from tests.engine.test_control_loop import any_control
 from tests.fuzz.refused import refused_in_one_line
 from tests.slopes.estimators.test_python import BRIGHT, FAULTS, FRAME, pipeline, raising
 
 import faintspot as fs
 from faintspot.engine.page.client_requests import Access
-from faintspot.io.frame_numbers import LARGEST_GAP, left_out
+from faintspot.io.telemetry import LARGEST_GAP, left_out
 from faintspot.slopes.estimators import estimators
 from faintspot.slopes.pipeline.settings import option_names
 

@@ -28,10 +28,8 @@ from tests.refusals import refused
 from faintspot.base import files
 from faintspot.base.errors import InputError
 from faintspot.base.flags import VARIABLES, Variable
-from faintspot.io import read_slopes
-from faintspot.io.arrays import zarr_store
+from faintspot.io import read_slopes, slopes_writer, slopes_zarr, zarr_store
 from faintspot.io.slopes import read_reference
-from faintspot.io.stored import slopes_writer, slopes_zarr
 
 CHANGED = {**result(), "x": result()["y"]}
 

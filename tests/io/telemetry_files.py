@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from faintspot.io.telemetry.recording import item_type
+from faintspot.io.telemetry import item_type
 
 N, SHAPE, WINDOW = 8, (24, 24), (8, 8)
 ATTRIBUTES: dict[str, Any] = {

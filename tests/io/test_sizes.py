@@ -16,11 +16,10 @@ from tests.io.frame_files import fits, h5py, tifffile, zarr
 from tests.io.slope_files import result, write
 
 from faintspot.base.files import read_arrays
-from faintspot.io import open_frames, read_array, read_slopes
-from faintspot.io.arrays.fits_units import units_of
-from faintspot.io.arrays.inflation import check_inflated
+from faintspot.io import open_frames, read_array, read_slopes, slopes_format
+from faintspot.io.fits_units import units_of
 from faintspot.io.slopes import read_reference
-from faintspot.io.stored import slopes_format
+from faintspot.io.zarr_store import check_inflated
 from faintspot.slopes.camera.calibration import Calibration
 from faintspot.slopes.spots.psf import PSF
 
@@ -210,10 +209,10 @@ def test_tiny_chunks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         file.create_dataset("frames", data=frames, chunks=(1, 2, 2))
     zarr.create_array(str(tmp_path / "a.zarr"), data=frames, chunks=(1, 2, 2))
     for name in ("a.h5", "a.zarr"):
-        monkeypatch.setattr("faintspot.io.arrays.stored_array.MOST_CHUNKS", 40)
+        monkeypatch.setattr("faintspot.io.stored_array.MOST_CHUNKS", 40)
         with open_frames([tmp_path / name]) as source:
             np.testing.assert_array_equal(source.block(0, 6), frames)
-        monkeypatch.setattr("faintspot.io.arrays.stored_array.MOST_CHUNKS", 15)
+        monkeypatch.setattr("faintspot.io.stored_array.MOST_CHUNKS", 15)
         with refused(name, "16 chunks in a frame"):
             open_frames([tmp_path / name])
 

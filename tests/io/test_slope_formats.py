@@ -20,9 +20,8 @@ from tests.refusals import refused
 
 from faintspot.base.errors import MissingExtraError
 from faintspot.base.flags import VARIABLES
-from faintspot.io import open_frames, read_slopes
+from faintspot.io import open_frames, read_slopes, slopes_format
 from faintspot.io.formats import csv_files
-from faintspot.io.stored import slopes_format
 
 fits = pytest.importorskip("astropy.io.fits")
 
@@ -126,7 +125,7 @@ def test_damaged_chunk_of_a_store(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, damage: str
 ) -> None:
     """Also where all values are 0, which is the fill value."""
-    monkeypatch.setattr("faintspot.io.stored.slopes_zarr._CHUNK_NUMBERS", 70)
+    monkeypatch.setattr("faintspot.io.slopes_zarr._CHUNK_NUMBERS", 70)
     whole = result()
     whole["flags"][20:30] = 0
     store = tmp_path / "slopes.zarr"

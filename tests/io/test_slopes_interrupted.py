@@ -12,8 +12,7 @@ from tests.io.slope_files import assert_alone, assert_stored, part, result, stor
 from tests.shared_data import ROOT
 
 import faintspot
-from faintspot.io import read_slopes
-from faintspot.io.stored import slopes_writer, slopes_zarr
+from faintspot.io import read_slopes, slopes_writer, slopes_zarr
 
 pytestmark = pytest.mark.slow
 
@@ -22,7 +21,7 @@ KILLED = """
 import sys
 from pathlib import Path
 sys.path[:0] = sys.argv[2:]
-from faintspot.io.stored import slopes_zarr
+from faintspot.io import slopes_zarr
 from tests.io import slope_files as t
 slopes_zarr._CHUNK_NUMBERS = 70
 whole = t.result(1000)

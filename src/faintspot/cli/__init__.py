@@ -32,17 +32,19 @@ _COMMANDS = {
     "wavefront": "Fit Zernike modes to slopes, and draw the wavefront.",
 }
 
-_MODULES = {
-    "layout": "layout.command",
-    "live": "realtime.live",
+_HOMES = {
+    "estimators": "tune:list_estimators",
+    "export": "report:export",
+    "layout": "layout.command:command",
+    "live": "realtime.run:live",
 }
-"""Modules of commands that are not named after them."""
+"""Module and function of commands whose module is not named after them."""
 _OF_POSIX = ("fcntl", "resource")
 
 
-def module_of(name: str) -> str:
-    """Return the name of the module that defines a command."""
-    return f"{__name__}.{_MODULES.get(name, name)}"
+def home_of(name: str) -> str:
+    """Return module and function of a command, with a colon between them."""
+    return f"{__name__}.{_HOMES.get(name, f'{name}:command')}"
 
 
 class _Interrupted(Exception):
@@ -56,8 +58,9 @@ class _LazyGroup(click.Group):
         """Import one command."""
         if name not in self.commands:
             return None
-        command: click.Command = import_module(module_of(name)).command
-        command.name = name  # in the modules all are called "command"
+        module, _, function = home_of(name).partition(":")
+        command: click.Command = getattr(import_module(module), function)
+        command.name = name  # most functions are called "command"
         return command
 
     def invoke(self, context: click.Context) -> object:

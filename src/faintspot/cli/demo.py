@@ -128,8 +128,7 @@ def write_files(
 
 def write_page(folder: Path, methods: list[MeasuredSlopes], **shown: Any) -> None:
     """Make the report."""
-    from faintspot.slopes.recorded.report.page import slopes_report
-    from faintspot.slopes.recorded.report.run import SlopesRun
+    from faintspot.slopes.recorded.page import SlopesRun, slopes_report
 
     facts = {
         "Source": "simulated, with known truth",

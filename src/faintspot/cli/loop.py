@@ -53,7 +53,7 @@ def command() -> None:
 @click.argument("name", metavar="[CONFIG]", required=False)
 def show(name: str | None) -> None:
     """Print a configuration as TOML with every value written out, or list the shipped ones."""
-    from faintspot.loop.simulation.configuration.configuration import load_loop, shipped_loops
+    from faintspot.loop.simulation.configuration import load_loop, shipped_loops
 
     if name is not None:
         click.echo(load_loop(name).to_text(), nl=False)
@@ -118,9 +118,8 @@ def magnitude(
       faintspot loop magnitude camera_3e --methods brightest,smoothed,tv,ml --flux-e 60,200,640
     """
     from faintspot.experiments.closed_loop.magnitude import run_magnitude, save_recommended
-    from faintspot.experiments.closed_loop.page import loop_page
-    from faintspot.experiments.closed_loop.verdict import loop_summary
-    from faintspot.loop.simulation.configuration.configuration import load_loop
+    from faintspot.experiments.closed_loop.verdict import loop_page, loop_summary
+    from faintspot.loop.simulation.configuration import load_loop
 
     loop = load_loop(configuration)
     folder, methods = output or (f"{loop.name}-quick" if quick else loop.name), _methods(methods)
@@ -185,7 +184,7 @@ def night(
     """
     from faintspot.experiments.night.page import PAGE_FILE, night_summary_text
     from faintspot.experiments.night.protocol import QUICK_PLAN, NightPlan
-    from faintspot.loop.simulation.configuration.configuration import load_loop
+    from faintspot.loop.simulation.configuration import load_loop
 
     plan = QUICK_PLAN if quick else NightPlan()
     plan = replace(plan, methods=methods, listed_strengths=strengths or (), unit=unit)
@@ -219,7 +218,7 @@ def engine(configuration: str, output: str, control: str, frame_rate_hz: float |
       faintspot loop engine canary -o bench
       faintspot loop engine faintspot-loop.toml --control kalman
     """
-    from faintspot.loop.simulation.configuration.configuration import load_loop
+    from faintspot.loop.simulation.configuration import load_loop
     from faintspot.loop.simulation.engine_files import write_engine_files
 
     loop = load_loop(configuration)

@@ -1,4 +1,4 @@
-"""faintspot report: a page of pictures and tables."""
+"""faintspot report and export: a page of pictures and tables, and telemetry for other software."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from faintspot.base.files import derived
 from faintspot.cli.shared.commands import option
 from faintspot.cli.shared.needs import needs
 from faintspot.experiments.store import kind_of_store
-from faintspot.io.arrays.zarr_store import holds_telemetry
-from faintspot.io.locations import split_location
+from faintspot.io.stored_array import split_location
+from faintspot.io.zarr_store import holds_telemetry
 from faintspot.loop.simulation.record import MAGNITUDE_FILE, holds_loop_results
 
 
@@ -55,8 +55,8 @@ def command(slopes: tuple[str, ...], output: str | None, recording: tuple[str, .
         split_location(name)  # refuses what is not there
     target = Path(output) if output is not None else derived(paths[0], ".html")
     if len(paths) == 1 and holds_loop_results(paths[0]):
-        from faintspot.experiments.closed_loop.page import loop_page
         from faintspot.experiments.closed_loop.results import MagnitudeResult
+        from faintspot.experiments.closed_loop.verdict import loop_page
 
         report = loop_page(MagnitudeResult.load(paths[0] / MAGNITUDE_FILE))
         target = target if output is not None else paths[0] / "report.html"
@@ -69,8 +69,37 @@ def command(slopes: tuple[str, ...], output: str | None, recording: tuple[str, .
 
         report = report_of_telemetry(paths[0])
     else:
-        from faintspot.slopes.recorded.report.stored import report_of_stored
+        from faintspot.slopes.recorded.stored import report_of_stored
 
         report = report_of_stored(paths, frames=[Path(path) for path in recording] or None)
     report.write(target)
     click.echo(f"{target}: open it in a browser")
+
+
+@needs("realtime", "zarr", "aotpy")
+@click.command()
+@click.argument("telemetry", type=click.Path(path_type=Path))
+@option("--output", "-o", metavar="FITS", help="File to write.", show_default="TELEMETRY.fits")
+@option(
+    "--ao-mode",
+    type=click.Choice(["SCAO", "SLAO", "GLAO", "MOAO", "LTAO", "MCAO"]),
+    default="SCAO",
+    help="What an AOT file says the sensor serves.",
+)
+def export(telemetry: Path, output: str | None, ao_mode: str) -> None:
+    """Write telemetry as a file of the Adaptive Optics Telemetry standard (AOT).
+
+    TELEMETRY is what `faintspot realtime record` wrote.
+
+    \b
+    Example:
+      faintspot export night.zarr -o night.fits
+    """
+    from faintspot.io import read_telemetry, write_aot
+
+    out = Path(output or derived(telemetry, ".fits"))
+    if out.suffix != ".fits":
+        raise InputError(f"{out}: expected a name that ends in .fits")
+    recorded = read_telemetry(telemetry)
+    write_aot(out, recorded, ao_mode=ao_mode)
+    click.echo(f"{out}: {len(recorded.frame)} frames, {len(recorded.image_frame)} images")

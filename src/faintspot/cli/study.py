@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     import xarray
 
-    from faintspot.experiments.night.blocks import Night
+    from faintspot.experiments.night.protocol import Night
     from faintspot.experiments.study.specification import StudySpecification
 
 _PAPER, _ESTIMATORS = "paper", "estimators"
@@ -103,10 +103,10 @@ def _repeat_the_paper(target: str, quick: bool, figures: tuple[str, ...], where:
     """Run the paper's study and its observations, and write a page and a table."""
     require("loop", "matplotlib", "jinja2", "hcipy", purpose="faintspot study paper")
     from faintspot.experiments.night.page import PAGE_FILE
-    from faintspot.experiments.paper.whole import paper_markdown, paper_rows
+    from faintspot.experiments.paper.claims import paper_markdown, paper_rows
     from faintspot.experiments.report import night_folder
     from faintspot.experiments.study.specification import FIGURES, NIGHT, paper_study
-    from faintspot.loop.simulation.configuration.configuration import load_loop
+    from faintspot.loop.simulation.configuration import load_loop
 
     of_study = tuple(name for name in figures or FIGURES if name not in (NIGHT, _LOOP))
     described = paper_study(quick, of_study) if of_study else None

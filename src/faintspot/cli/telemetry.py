@@ -186,7 +186,7 @@ def command(
 
 def _alternates(recording: Path) -> bool:
     """Return whether a recording is of methods that alternated in a closed loop."""
-    from faintspot.io.arrays.zarr_store import holds_telemetry
+    from faintspot.io.zarr_store import holds_telemetry
 
     if not (recording.is_dir() and holds_telemetry(recording)):
         return False
@@ -204,8 +204,8 @@ def _report_night(
     settle: int | None,
 ) -> None:
     """Write the page and the numbers of methods that alternated."""
-    from faintspot.experiments.night.measured_strehl import read_strehl
     from faintspot.experiments.night.recorded import recorded_night
+    from faintspot.experiments.night.recorded_methods import read_strehl
     from faintspot.experiments.night.recorded_page import (
         page_of_recording,
         summary_of_recording,
@@ -233,11 +233,11 @@ def _over_time(loop: Recording, every_s: float) -> list[Piece]:
 
 def _record(engine: str, store: Path, seconds: float) -> None:
     """Record a running engine to a new store."""
-    from faintspot.cli.realtime.record import record_engine, summary
+    from faintspot.cli.realtime.control import record_engine, recording_summary
 
     if store.suffix != ".zarr":
         raise InputError(f"{store}: expected a name that ends in .zarr, for the recording of --engine")
     report = record_engine(engine, store, None, seconds)
-    click.echo(f"{engine}: {summary(report)}", err=True)
+    click.echo(f"{engine}: {recording_summary(report)}", err=True)
     if not report.frames:
         raise InputError(f"{engine}: no frames in {report.seconds:.1f} s; start its source of frames")

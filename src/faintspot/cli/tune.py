@@ -1,4 +1,4 @@
-"""faintspot tune: which estimator, with which settings."""
+"""faintspot tune and estimators: which estimator, with which settings, and what their options mean."""
 
 from __future__ import annotations
 
@@ -23,6 +23,7 @@ from faintspot.experiments.planner import text as answer_text
 from faintspot.experiments.planner.question import Question
 from faintspot.slopes.camera.binning import binned, binned_calibration, camera_calibration
 from faintspot.slopes.camera.calibration import Calibration
+from faintspot.slopes.estimators.registry import allowed_in_words, estimator_named, estimators, needs_in_words
 from faintspot.slopes.pipeline import configuration
 from faintspot.slopes.sensor.binning import binned_layout
 from faintspot.slopes.sensor.layout import Layout
@@ -33,6 +34,7 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from faintspot.experiments.planner.answer import Answer
+
 
 _MOST_FRAMES, _MOST_PIXELS = 200, 1 << 26
 _GIVEN = "Sources"
@@ -259,3 +261,35 @@ def _say_what_is_next(answer: Answer, target: Path, picture: Path | None, frames
         click.echo(
             f"Next: faintspot slopes {names} --config {shlex.quote(str(target))} -o {suggested_slopes()}"
         )
+
+
+@click.command()
+@click.argument("name", required=False)
+def list_estimators(name: str | None) -> None:
+    """List all estimators, those of installed packages included, or the options of the named one.
+
+    \b
+    Examples:
+      faintspot estimators
+      faintspot estimators tv
+    """
+    from rich.table import Table
+
+    from faintspot.slopes.pipeline.settings import SharedOptions
+
+    table = Table(box=None, pad_edge=False)
+    if name is None:
+        for heading in ("name", "method", "requires"):
+            table.add_column(heading)
+        for own, kind in estimators().items():
+            table.add_row(own, kind.method or kind.label, needs_in_words(kind))
+    else:
+        kind = estimator_named(name)
+        for heading in ("option", "default", "allowed", "meaning"):
+            table.add_column(heading)
+        for owner in (kind, SharedOptions):
+            defaults = owner.defaults()
+            for option, declared in owner.declared().items():
+                default = "" if defaults[option] is None else str(defaults[option])
+                table.add_row(option, default, allowed_in_words(declared), declared.meaning)
+    Console().print(table)

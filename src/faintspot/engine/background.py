@@ -17,11 +17,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.errors import InputError
+from faintspot.engine.child_processes import ONE_THREAD, ChildProcesses, lowest_priority
 from faintspot.engine.engine import Engine
-from faintspot.engine.requests.child_processes import ONE_THREAD, ChildProcesses, lowest_priority
-from faintspot.engine.requests.requests import LENGTHY_TIMEOUT_S, request, socket_path
+from faintspot.engine.requests import LENGTHY_TIMEOUT_S, request, socket_path
 from faintspot.engine.telemetry.ring import TelemetryRing
-from faintspot.io.telemetry.recording import Telemetry, stored_names
+from faintspot.io.telemetry import Telemetry, stored_names
 from faintspot.loop.control.base import KALMAN
 from faintspot.loop.control.configuration import Control, load_control, prior_std_px
 from faintspot.loop.control.identification.learning import FEWEST_FRAMES, RelearntControl, relearn

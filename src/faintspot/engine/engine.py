@@ -11,21 +11,26 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from faintspot.base.errors import InputError
-from faintspot.engine.loop.control_loop import CLOSED, OPEN, STATES, ControlLoop
+from faintspot.engine.control_loop import CLOSED, OPEN, STATES, ControlLoop
 from faintspot.engine.path.frame_path import FramePath
 from faintspot.engine.path.timing import INCOMPLETE, WORKER, FrameAccount
 from faintspot.engine.path.workers import SlopePrior, Workers
 from faintspot.engine.pixels.pixel_ring import PixelRing, living_ring
 from faintspot.engine.settings.estimators import EngineEstimators
-from faintspot.engine.settings.following import DarkFollower, FluxFollower
 from faintspot.engine.settings.interleaving import EVERY, FIRST_METHOD, METHODS, Interleaving
-from faintspot.engine.settings.plan import EngineOptions, EnginePlan, FrameInput, SettingsPreparer
+from faintspot.engine.settings.plan import (
+    DarkFollower,
+    EngineOptions,
+    EnginePlan,
+    FluxFollower,
+    FrameInput,
+    SettingsPreparer,
+)
 from faintspot.engine.settings.running_settings import Change, RunningSettings
 from faintspot.engine.streams.slope_streams import SlopeStreams
 from faintspot.engine.telemetry.ring import TelemetryRing
-from faintspot.loop.control.configuration import Control
+from faintspot.loop.control.configuration import Control, packed_control
 from faintspot.loop.control.options import NONE, STREAM
-from faintspot.loop.control.recorded import packed_control
 from faintspot.slopes.pipeline.configuration import packed, to_text
 from faintspot.slopes.pipeline.settings import Settings
 from faintspot.slopes.pipeline.slope_pipeline import SlopePipeline

@@ -19,12 +19,11 @@ from faintspot.base.files import Closing
 from faintspot.base.text_files import check_keys
 from faintspot.engine.pixels.pixel_ring import PixelRing
 from faintspot.engine.pixels.readout import CameraReport, Readout, RowTimes, StopEvent, readout_type
-from faintspot.engine.requests.requests import EFFECT_TIMEOUT_S, Handler, changes_of
+from faintspot.engine.requests import EFFECT_TIMEOUT_S, Handler, changes_of
 from faintspot.engine.streams.command_stream import CommandStream
 from faintspot.engine.streams.shared_streams import create_stream, held
-from faintspot.loop.simulation.configuration.configuration import LoopConfiguration
-from faintspot.loop.simulation.telescope.calibration import make_detector
-from faintspot.loop.simulation.telescope.model import TelescopeModel
+from faintspot.loop.simulation.configuration import LoopConfiguration
+from faintspot.loop.simulation.telescope import TelescopeModel, make_detector
 from faintspot.loop.turbulence.slope_covariance import ARCSEC
 from faintspot.slopes.spots.von_karman import R0_WAVELENGTH_M
 

@@ -19,7 +19,7 @@ from faintspot.slopes.estimators.built_in.smoothed import Smoothed
 from faintspot.slopes.estimators.built_in.thresholded import Thresholded
 from faintspot.slopes.estimators.built_in.total_variation import TotalVariation
 from faintspot.slopes.estimators.registry import estimators
-from faintspot.slopes.estimators.scene import Scene
+from faintspot.slopes.estimators.sensor import Scene
 from faintspot.slopes.pipeline.settings import Settings
 from faintspot.slopes.spots.psf import PSF
 

@@ -16,24 +16,25 @@ from faintspot.base.report.page import FigureWithData, Report, Section, configur
 from faintspot.base.report.plots import Line, Panel
 from faintspot.base.report.texts import Texts
 from faintspot.experiments.methods import knows_the_spot, label_of, style_of
-from faintspot.experiments.night.blocks import NIGHT_STORE, Night, load_night
 from faintspot.experiments.night.page import night_sections
-from faintspot.experiments.paper.claims import guidance, verdicts
+from faintspot.experiments.night.protocol import NIGHT_STORE, Night, load_night
+from faintspot.experiments.paper.claims import (
+    baselines_section,
+    gains_section,
+    grouped,
+    guidance,
+    in_words,
+    paper_rows,
+    paper_section,
+    parameter_in_words,
+    verdicts,
+)
 from faintspot.experiments.paper.figures import (
     axis_of_study,
     baselines_figure,
     kept_pixels_figure,
     sweep_figure,
     triple_picture,
-)
-from faintspot.experiments.paper.whole import (
-    baselines_section,
-    gains_section,
-    grouped,
-    in_words,
-    paper_rows,
-    paper_section,
-    parameter_in_words,
 )
 from faintspot.experiments.study.curves import StudyConditions
 from faintspot.experiments.study.specification import BEST, CORRECTED, StudySpecification

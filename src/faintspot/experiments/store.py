@@ -16,11 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base import __version__
-from faintspot.base.errors import InputError
+from faintspot.base.errors import InputError, load_zarr
 from faintspot.base.files import output_errors
-from faintspot.io.arrays.zarr_store import stored_attributes
-from faintspot.io.locations import one_line
-from faintspot.io.optional_packages import load_zarr
+from faintspot.io.stored_array import one_line
+from faintspot.io.zarr_store import stored_attributes
 
 if TYPE_CHECKING:
     import xarray

@@ -5,32 +5,32 @@ from typing import TYPE_CHECKING
 from faintspot.base.errors import lazy_attributes
 
 if TYPE_CHECKING:
+    from faintspot.io.aot_reading import AotSensor as AotSensor
+    from faintspot.io.aot_reading import read_aot as read_aot
+    from faintspot.io.aot_writing import write_aot as write_aot
     from faintspot.io.frames import FrameSource as FrameSource
     from faintspot.io.frames import open_frames as open_frames
     from faintspot.io.frames import read_array as read_array
     from faintspot.io.slopes import create_writer as create_writer
     from faintspot.io.slopes import read_slopes as read_slopes
-    from faintspot.io.stored.slopes_format import StoredSlopes as StoredSlopes
-    from faintspot.io.stored.slopes_writer import SlopeWriter as SlopeWriter
-    from faintspot.io.telemetry.aot_reading import AotSensor as AotSensor
-    from faintspot.io.telemetry.aot_reading import read_aot as read_aot
-    from faintspot.io.telemetry.aot_writing import write_aot as write_aot
-    from faintspot.io.telemetry.recording import Telemetry as Telemetry
-    from faintspot.io.telemetry.recording import read_telemetry as read_telemetry
+    from faintspot.io.slopes_format import StoredSlopes as StoredSlopes
+    from faintspot.io.slopes_writer import SlopeWriter as SlopeWriter
+    from faintspot.io.telemetry import Telemetry as Telemetry
+    from faintspot.io.telemetry import read_telemetry as read_telemetry
 
 _HOMES = {
-    "AotSensor": "faintspot.io.telemetry.aot_reading",
+    "AotSensor": "faintspot.io.aot_reading",
     "FrameSource": "faintspot.io.frames",
-    "SlopeWriter": "faintspot.io.stored.slopes_writer",
-    "StoredSlopes": "faintspot.io.stored.slopes_format",
-    "Telemetry": "faintspot.io.telemetry.recording",
+    "SlopeWriter": "faintspot.io.slopes_writer",
+    "StoredSlopes": "faintspot.io.slopes_format",
+    "Telemetry": "faintspot.io.telemetry",
     "create_writer": "faintspot.io.slopes",
     "open_frames": "faintspot.io.frames",
-    "read_aot": "faintspot.io.telemetry.aot_reading",
+    "read_aot": "faintspot.io.aot_reading",
     "read_array": "faintspot.io.frames",
     "read_slopes": "faintspot.io.slopes",
-    "read_telemetry": "faintspot.io.telemetry.recording",
-    "write_aot": "faintspot.io.telemetry.aot_writing",
+    "read_telemetry": "faintspot.io.telemetry",
+    "write_aot": "faintspot.io.aot_writing",
 }
 
 __all__ = [*sorted(_HOMES)]

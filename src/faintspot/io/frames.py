@@ -15,9 +15,8 @@ from numpy.typing import NDArray
 
 from faintspot.base.errors import InputError, MissingExtraError
 from faintspot.base.files import Closing, check_bytes, check_size
-from faintspot.io.arrays.stored_array import MOST_WHOLE_BYTES, StoredArray, arranged
 from faintspot.io.formats.registry import frame_format
-from faintspot.io.locations import one_line, split_location
+from faintspot.io.stored_array import MOST_WHOLE_BYTES, StoredArray, arranged, one_line, split_location
 
 _MOST_PIXELS = 1 << 26  # in a frame: 8192 x 8192
 

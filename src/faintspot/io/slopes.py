@@ -11,16 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.checks import finite_array, number_between, one_of
-from faintspot.base.errors import InputError, MissingExtraError, errors_within
+from faintspot.base.errors import InputError, MissingExtraError, errors_within, has_zarr
 from faintspot.base.files import check_regular, output_errors
 from faintspot.base.flags import VARIABLES, leave_out, scaled_positions
 from faintspot.io.formats.file_format import FileFormat
 from faintspot.io.formats.registry import slope_endings, slope_format
 from faintspot.io.formats.zarr_files import Zarr
 from faintspot.io.frames import read_array
-from faintspot.io.locations import one_line, split_location
-from faintspot.io.optional_packages import has_zarr
-from faintspot.io.stored.slopes_format import (
+from faintspot.io.slopes_format import (
     RESERVED_ATTRIBUTES,
     UNITS,
     RecordingHeader,
@@ -29,8 +27,9 @@ from faintspot.io.stored.slopes_format import (
     json_values,
     pixels_in,
 )
-from faintspot.io.stored.slopes_writer import OutputLock, SlopeWriter
-from faintspot.io.stored.slopes_zarr import SlopeStore, describe_store, remove_store
+from faintspot.io.slopes_writer import OutputLock, SlopeWriter
+from faintspot.io.slopes_zarr import SlopeStore, describe_store, remove_store
+from faintspot.io.stored_array import one_line, split_location
 
 _Result = TypeVar("_Result")
 

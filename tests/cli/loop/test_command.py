@@ -11,10 +11,9 @@ from faintspot.cli import loop as command
 from faintspot.experiments.closed_loop import magnitude
 from faintspot.experiments.closed_loop.results import MagnitudeResult
 from faintspot.experiments.night import page, protocol
-from faintspot.experiments.night.blocks import load_night
-from faintspot.experiments.night.protocol import NightPlan
+from faintspot.experiments.night.protocol import NightPlan, load_night
 from faintspot.loop.control.configuration import load_control
-from faintspot.loop.simulation.configuration.configuration import LoopConfiguration, load_loop, shipped_loops
+from faintspot.loop.simulation.configuration import LoopConfiguration, load_loop, shipped_loops
 from faintspot.slopes.pipeline import configuration
 
 pytest.importorskip("hcipy")

@@ -14,8 +14,8 @@ pytest.importorskip("zarr")
 
 from tests.engine.page.cases import LAYOUT, N, records
 
+from faintspot.engine.telemetry.recorder import TelemetryStore
 from faintspot.engine.telemetry.ring import image_type, layout_values
-from faintspot.io.telemetry.writing import TelemetryStore
 
 pytestmark = pytest.mark.slow
 

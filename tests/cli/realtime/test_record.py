@@ -13,8 +13,8 @@ pytest.importorskip("zarr")
 from tests.engine.telemetry_cases import LAYOUT, SETTINGS, Engine, as_written
 
 from faintspot.base.errors import InputError
-from faintspot.cli.export import command as export
-from faintspot.cli.realtime.record import record
+from faintspot.cli.realtime.control import record
+from faintspot.cli.report import export as export
 from faintspot.engine.pixels.segment import FOLDER
 from faintspot.engine.telemetry.ring import TelemetryRing
 from faintspot.io import read_telemetry
@@ -36,14 +36,14 @@ def engine() -> Iterator[Engine]:
         yield running
 
 
-def said(command: click.Command, *arguments: str) -> str:
+def said(export: click.Command, *arguments: str) -> str:
     """What a command prints; its errors come through."""
-    return CliRunner().invoke(command, arguments, catch_exceptions=False).output
+    return CliRunner().invoke(export, arguments, catch_exceptions=False).output
 
 
-def refused(command: click.Command, *arguments: str) -> str:
+def refused(export: click.Command, *arguments: str) -> str:
     """The message of an InputError."""
-    error = CliRunner().invoke(command, arguments).exception
+    error = CliRunner().invoke(export, arguments).exception
     assert isinstance(error, InputError)
     return str(error)
 

@@ -22,9 +22,9 @@ from tests.engine.bench import Bench, simulated
 from faintspot.base.checks import number_between
 from faintspot.engine.page.server import LiveServer, serve
 from faintspot.engine.request_handlers import LENGTHY, commands_of
-from faintspot.engine.requests.requests import ControlServer, socket_path
+from faintspot.engine.requests import ControlServer, socket_path
 from faintspot.engine.telemetry.recorder import Recorder
-from faintspot.io.telemetry.recording import read_telemetry
+from faintspot.io.telemetry import read_telemetry
 
 CHROMIUM = next((found for name in ("chromium", "chromium-browser") if (found := shutil.which(name))), None)
 pytestmark = [

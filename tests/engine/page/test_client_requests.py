@@ -12,9 +12,9 @@ from tests.engine.telemetry_cases import LAYOUT, Engine
 
 from faintspot.base.errors import InputError
 from faintspot.engine.page.client_requests import EngineRequests, answered
-from faintspot.engine.requests.requests import ControlServer, socket_path
+from faintspot.engine.requests import ControlServer, socket_path
 from faintspot.engine.telemetry.ring import TelemetryRing
-from faintspot.io.telemetry.recording import read_telemetry
+from faintspot.io.telemetry import read_telemetry
 
 pytestmark = pytest.mark.slow
 

@@ -13,9 +13,9 @@ from faintspot.base.errors import InputError
 from faintspot.engine.page import engine_source as recording_source
 from faintspot.engine.page.client_requests import answered
 from faintspot.engine.page.engine_source import RecordingSource, indices_of
+from faintspot.engine.telemetry.recorder import TelemetryStore
 from faintspot.engine.telemetry.ring import image_type, layout_values
-from faintspot.io.telemetry.recording import StoredTelemetry
-from faintspot.io.telemetry.writing import TelemetryStore
+from faintspot.io.telemetry import StoredTelemetry
 
 FRAMES = 10_000
 """100 s; chunks of slopes hold 8192 frames."""

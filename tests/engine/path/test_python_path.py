@@ -11,11 +11,12 @@ from typing import Any
 import numpy as np
 import pytest
 from tests.engine.bench import LAYOUT, SETTINGS, make, simulated
+from tests.patience import wait_for
 
 import faintspot as fs
 from faintspot.base.flags import INVALID
 from faintspot.engine.path.frame_path import Progress
-from faintspot.engine.path.python_path import PythonPath, call_within, tried
+from faintspot.engine.path.python_path import PythonPath, call_is_under_way, call_within, end_thread, tried
 from faintspot.engine.path.workers import SlopePrior
 from faintspot.slopes.estimators import Estimator, Positions
 
@@ -176,3 +177,34 @@ def test_a_path_that_is_forgotten_ends_its_thread() -> None:
     assert path() is None
     thread.join(GENEROUS_S)
     assert not thread.is_alive()
+
+
+PATIENCE_S = 10.0
+
+
+def forever() -> None:
+    while True:
+        pass
+
+
+def test_what_comes_back_in_time() -> None:
+    assert call_within(PATIENCE_S, "sum", lambda *numbers: sum(numbers), 1, 2) == 3
+    assert call_within(PATIENCE_S, "nothing", lambda: None) is None
+    assert call_within(PATIENCE_S, "itself", call_is_under_way)
+
+
+def test_its_errors_are_the_callers() -> None:
+    with pytest.raises(ValueError, match="two"):
+        call_within(PATIENCE_S, "number", int, "two")
+
+
+def test_what_does_not_come_back() -> None:
+    known = set(threading.enumerate())
+    with pytest.raises(fs.InputError, match=r"^loop: did not return within 0\.05 s$"):
+        call_within(0.05, "loop", forever)
+    wait_for(lambda: not set(threading.enumerate()) - known)
+    assert not call_is_under_way()
+
+
+def test_a_thread_that_has_not_begun_is_left_alone() -> None:
+    end_thread(threading.Thread(target=forever))

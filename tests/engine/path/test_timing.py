@@ -1,11 +1,22 @@
 import json
+import mmap
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from faintspot.engine.path.timing import RESOLUTION, Counters, Latencies
+from faintspot.engine.path.timing import (
+    IN_TIME,
+    OTHER,
+    PAGE_FAULT,
+    PREPARING,
+    RESOLUTION,
+    WOKEN_LATE,
+    Counters,
+    Latencies,
+    Lateness,
+)
 
 # From nothing to 130 s, each order of magnitude as likely as the others.
 durations = st.integers(0, 37).flatmap(lambda bits: st.integers(0, 2**bits - 1))
@@ -62,3 +73,30 @@ def test_counters_are_plain_numbers() -> None:
     counters.dropped += 2
     assert counters.as_dict() == {**Counters().as_dict(), "dropped": 2}
     assert set(Counters().as_dict().values()) == {0}
+
+
+def test_a_frame_in_time_has_no_cause() -> None:
+    assert Lateness().cause(False, True, 1, 0) == IN_TIME
+
+
+def test_settings_that_are_prepared_come_first() -> None:
+    assert Lateness().cause(True, True, 1, 0) == PREPARING
+
+
+def test_a_page_that_was_missing() -> None:
+    lateness = Lateness()
+    lateness.cause(False, False, 0, 0)
+    with mmap.mmap(-1, 1 << 20) as memory:
+        memory[1 << 19] = 1
+        assert lateness.cause(True, False, 0, 0) == PAGE_FAULT
+
+
+def test_only_what_has_happened_since_the_frame_before_counts() -> None:
+    lateness = Lateness()
+    causes = set()
+    for _ in range(20):  # now and then something really happens
+        lateness.cause(False, False, 3, 0)
+        causes.add(lateness.cause(True, False, 3, 0))
+    assert OTHER in causes
+    assert WOKEN_LATE not in causes
+    assert any(lateness.cause(True, False, 4 + k, 0) == WOKEN_LATE for k in range(20))

@@ -10,9 +10,9 @@ from tests.slopes.recorded.recorded_cases import Page
 from faintspot.base.errors import InputError
 from faintspot.engine.telemetry.numbers import change_rows, gaps, methods_in_turn, quantities, timing
 from faintspot.engine.telemetry.page import latency_figure, report_of_telemetry
+from faintspot.engine.telemetry.recorder import TelemetryStore
 from faintspot.engine.telemetry.ring import image_type, layout_values, record_type
-from faintspot.io.telemetry.recording import Telemetry, read_telemetry
-from faintspot.io.telemetry.writing import TelemetryStore
+from faintspot.io.telemetry import Telemetry, read_telemetry
 from faintspot.slopes.sensor.layout import Layout
 
 LAYOUT = Layout.grid((4, 4), pixels=8)

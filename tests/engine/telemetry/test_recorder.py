@@ -22,10 +22,9 @@ from tests.patience import wait_for
 from faintspot.base.errors import InputError
 from faintspot.engine.pixels.segment import FOLDER
 from faintspot.engine.telemetry import recorder
-from faintspot.engine.telemetry.recorder import Recorder
+from faintspot.engine.telemetry.recorder import Recorder, TelemetryStore
 from faintspot.engine.telemetry.ring import TelemetryRing
 from faintspot.io import read_telemetry
-from faintspot.io.telemetry.writing import TelemetryStore
 
 pytestmark = pytest.mark.skipif(not FOLDER.is_dir(), reason="needs POSIX shared memory as Linux has it")
 with_threads = pytest.mark.slow

@@ -1,14 +1,37 @@
+import math
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from numpy.typing import ArrayLike, NDArray
+from tests.experiments.experiment_cases import small
 from tests.experiments.result_cases import made_up_magnitude
 from tests.refusals import refused
 
 from faintspot.base.errors import InputError
-from faintspot.experiments.closed_loop.results import MagnitudeResult
+from faintspot.base.statistics import mean_by_blocks
+from faintspot.experiments.closed_loop.results import (
+    LOOP_GAIN,
+    MagnitudeResult,
+    default_methods,
+    differences_by_flux,
+    falling,
+    gains_in_magnitude,
+    magnitude_gain,
+    magnitude_limit,
+    tuned_values,
+    with_choice,
+)
+from faintspot.experiments.methods import crossings
+from faintspot.loop.simulation.methods import Method
 from faintspot.loop.simulation.record import MAGNITUDE_FILE, holds_loop_results, make_folder
+from faintspot.loop.simulation.simulation import simulate_loop
+from faintspot.slopes.estimators.base import Estimator
+from faintspot.slopes.estimators.registry import estimators
 
 
 def assert_equal(one: Any, other: Any) -> None:
@@ -46,3 +69,236 @@ def test_folders_that_cannot_be(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(InputError, match="cannot be made"):
         make_folder(tmp_path / "file")
+
+
+MAGNITUDES = np.linspace(8.0, 13.0, 6)
+numbers = arrays(np.float64, st.integers(1, 12), elements=st.floats(-1, 1))
+
+
+def _crossed(magnitudes: ArrayLike, strehl: ArrayLike, level: float, **options: bool) -> NDArray[np.float64]:
+    return crossings(np.asarray(magnitudes, np.float64), falling(strehl), level, **options)
+
+
+def curves(shift: float, realisations: int = 6, scatter: float = 0.02) -> np.ndarray:
+    atmosphere = np.random.default_rng(2).normal(0, scatter, realisations)  # the same for every method
+    return 0.7 - 0.1 * (MAGNITUDES[:, None] - shift - 8) + atmosphere
+
+
+@given(numbers)
+def test_falling_curves_never_rise_and_keep_their_mean(values: np.ndarray) -> None:
+    found = falling(values)
+    assert (np.diff(found) <= 1e-12).all()
+    assert found.mean() == pytest.approx(values.mean(), abs=1e-9)
+    np.testing.assert_allclose(falling(found), found, atol=1e-12)
+
+
+def test_a_curve_that_falls_stays_as_it_is() -> None:
+    np.testing.assert_array_equal(falling([3.0, 2.0, 2.0, 1.0]), [3, 2, 2, 1])
+
+
+@given(numbers)
+def test_falling_is_pool_adjacent_violators(values: np.ndarray) -> None:
+    pools: list[list[float]] = []
+    for value in values:
+        pools.append([float(value)])
+        while len(pools) > 1 and np.mean(pools[-2]) < np.mean(pools[-1]):
+            pools[-2:] = [pools[-2] + pools[-1]]
+    expected = np.concatenate([[np.mean(pool)] * len(pool) for pool in pools])
+    np.testing.assert_allclose(falling(values), expected, atol=1e-9)
+
+
+def test_many_curves_at_once_are_as_one_by_one() -> None:
+    many = np.random.default_rng(9).uniform(0, 1, (50, 6))
+    np.testing.assert_allclose(falling(many), [falling(one) for one in many])
+    together = _crossed(MAGNITUDES, many, 0.5)
+    np.testing.assert_allclose(together, [_crossed(MAGNITUDES, one, 0.5) for one in many])
+
+
+def test_the_limiting_magnitude_lies_between_points() -> None:
+    assert _crossed([8, 9, 10], [0.6, 0.5, 0.3], 0.4, straight=True) == pytest.approx(9.5)
+    assert _crossed([8, 9, 10], [0.5, 0.4, 0.3], 0.35) == pytest.approx(9.5)
+    assert _crossed([8, 9, 10], [0.6, 0.5, 0.3], 0.5) == pytest.approx(9.0)
+    assert _crossed([8, 9], [0.6, 0.5], 0.4) == math.inf
+    assert _crossed([8, 9], [0.3, 0.2], 0.4) == -math.inf
+
+
+@pytest.mark.parametrize("apart", [0.5, 1.0, 1.5])
+def test_limits_of_curves_that_bend_hold_within_their_errors(apart: float) -> None:
+    """A third of the error of straight lines, which is the error that is stated."""
+    wrong, stated, straight = [], [], []
+    for middle in np.linspace(10.0, 11.0, 9):
+        for level in (0.15, 0.3, 0.45):
+            faint = np.arange(7.0, 14.5, apart)
+            strehl = 0.6 / (1 + np.exp((faint - middle) / 0.7))
+            truth = middle + 0.7 * np.log(0.6 / level - 1)
+            limit = magnitude_limit(faint, np.tile(strehl[:, None], 6), level)
+            wrong.append(limit.magnitude.value - truth)
+            stated.append(limit.estimate.standard_error)
+            straight.append(float(_crossed(faint, strehl, level, straight=True)) - truth)
+    rms, of_lines = (float(np.sqrt(np.square(errors).mean())) for errors in (wrong, straight))
+    assert rms < 0.6 * of_lines
+    assert rms < float(np.sqrt(np.square(stated).mean())) < 1.5 * of_lines
+
+
+def test_a_gain_between_curves_that_bend_differently_is_not_that_of_lines() -> None:
+    """Stars 1.5 magnitudes apart: lines are wrong by more than the error, which both results state."""
+    faint = np.arange(7.0, 14.5, 1.5)
+    one, other = (0.6 / (1 + np.exp((faint - middle) / 0.5)) for middle in (11.0, 10.25))
+    runs, others = (np.tile(curve[:, None], 6) for curve in (one, other))
+    gain = magnitude_gain(faint, runs, others, 0.15)
+    assert gain.interpolation_error > 0.02
+    assert abs(gain.magnitude.value - 0.75) < 2 * gain.interpolation_error
+    found = gain.estimate
+    assert found.low < 0.75 < found.high
+
+
+def test_two_stars_show_no_bend_and_the_interval_says_so() -> None:
+    faint = [9.0, 10.5]
+    one, other = (0.6 / (1 + np.exp((np.array(faint) - middle) / 0.5)) for middle in (10.4, 9.8))
+    runs, others = (np.tile(curve[:, None], 6) for curve in (one, other))
+    found = magnitude_gain(faint, runs, others, 0.35).estimate
+    assert found.standard_error == pytest.approx(1.5 * math.sqrt(2 / 12))
+    assert found.low < 0.6 < found.high
+    assert abs(found.value - 0.6) > 0.05
+
+
+def test_the_gain_is_the_shift_between_two_curves() -> None:
+    # Straight lines moved by 0.3 mag; air that is common to both moves them together.
+    found = magnitude_gain(MAGNITUDES, curves(0.3), curves(0.0), 0.45).estimate
+    assert found.value == pytest.approx(0.3)
+    assert found.low == pytest.approx(0.3)
+    assert found.high == pytest.approx(0.3)
+    assert found.decided == 1
+
+
+def test_the_order_of_magnitudes_does_not_matter() -> None:
+    one = magnitude_gain(MAGNITUDES, curves(0.3), curves(0.0), 0.45)
+    other = magnitude_gain(MAGNITUDES[::-1], curves(0.3)[::-1], curves(0.0)[::-1], 0.45)
+    assert one == other
+
+
+def test_a_gain_beyond_what_was_measured_is_not_made_up() -> None:
+    assert magnitude_gain(MAGNITUDES, curves(3.0), curves(0.0), 0.35).magnitude.value == math.inf
+    assert magnitude_gain(MAGNITUDES, curves(0.0), curves(3.0), 0.35).magnitude.value == -math.inf
+    assert math.isnan(magnitude_gain(MAGNITUDES, curves(3.0), curves(3.0), 0.35).magnitude.value)
+
+
+def test_an_interval_that_leaves_the_magnitudes_is_open() -> None:
+    found = magnitude_gain(MAGNITUDES, curves(0.9, scatter=0.1), curves(0.0, scatter=0.0), 0.31).estimate
+    assert math.isfinite(found.value)
+    assert found.high == math.inf
+
+
+def test_two_realisations_give_no_interval() -> None:
+    found = magnitude_gain(MAGNITUDES, curves(0.3, 2), curves(0.0, 2), 0.45).estimate
+    assert found.value == pytest.approx(0.3)
+    assert math.isnan(found.low)
+
+
+def test_what_is_not_measured_yet_is_left_out() -> None:
+    missing = curves(0.3)
+    missing[0, 2] = np.nan
+    found = magnitude_gain(MAGNITUDES, missing, curves(0.0), 0.45).magnitude
+    assert found.value == pytest.approx(0.3)
+    assert math.isnan(magnitude_gain(MAGNITUDES, missing * np.nan, curves(0.0), 0.45).magnitude.value)
+
+
+def test_block_intervals_hold_as_often_as_they_say() -> None:
+    # 300 series of 40 values: 95 % holds within 4 % (three standard errors), and narrow series are honest.
+    rng = np.random.default_rng(8)
+    inside = 0
+    for _ in range(300):
+        found = mean_by_blocks(rng.normal(1.0, 0.5, 40), 1, rng)
+        inside += found.low <= 1.0 <= found.high
+    assert 0.91 <= inside / 300 <= 0.99
+
+
+def test_gains_in_magnitude_are_those_of_the_curves() -> None:
+    result = made_up_magnitude(0.3)
+    gains = gains_in_magnitude(result, 1, 0)
+    assert list(gains)[:2] == [0.05, 0.1]
+    assert gains[0.3].value == pytest.approx(0.3, abs=0.05)
+    assert gains[0.3].decided == 1
+
+
+def test_differences_by_flux_are_paired() -> None:
+    result = made_up_magnitude(0.3)
+    for estimate, runs in zip(
+        differences_by_flux(result, 1, 0), result.strehl[1] - result.strehl[0], strict=True
+    ):
+        assert estimate.value == pytest.approx(runs.mean())
+        assert estimate.high - estimate.low < 0.02  # the air's 0.02 is common to both
+
+
+NAMES = (*estimators(), "ml+weighted", "map+predicted+weighted", "tv+uncorrected")
+
+
+def first_choice(name: str) -> dict[str, Any]:
+    return {key: each.first[-1] for key, each in tuned_values(Method.named(name), BRIGHT).items()} | {
+        LOOP_GAIN: 0.2
+    }
+
+
+BRIGHT = small().replace("camera", photons_per_subaperture=1000.0)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_every_method_closes_the_loop(name: str) -> None:
+    """Not for long and not well, but better than no correction: Strehl ratio 0.17 then."""
+    kind = Method.named(name)
+    record = simulate_loop(BRIGHT, [with_choice(kind, BRIGHT, first_choice(name))])
+    assert record.labels == (kind.label,)
+    assert np.isfinite(record.slopes_px).all()
+    assert record.mean_strehl() > 0.35
+
+
+def test_names_say_what_the_loop_does() -> None:
+    for name in NAMES:
+        assert Method.named(name).name == name
+    assert Method.named("map+weighted+predicted").name == "map+predicted+weighted"
+    name = "map+predicted+weighted"
+    method = with_choice(Method.named(name), BRIGHT, first_choice(name))
+    assert method.is_predicted
+    assert method.variants == ("predicted", "weighted")
+    assert not method.corrects_gain
+    assert Method.named("weighted").variants == ()
+    assert len({Method.named(name).label for name in NAMES}) == len(NAMES)
+
+
+def test_defaults_suit_the_configuration() -> None:
+    usual = default_methods(small())
+    assert set(estimators()) <= set(usual)
+    assert {"ml+weighted", "map+predicted", "map+predicted+weighted"} <= set(usual)
+    assert not any(name.endswith("+uncorrected") for name in usual)
+    assert "tv+uncorrected" in default_methods(small().replace("control", mode="open"))
+
+
+def test_an_estimator_of_ones_own_is_an_method(
+    own_estimator: type[Estimator], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    powers = [2.0, 1.5, 3.0, 4.0, 5.0]
+    monkeypatch.setattr(own_estimator, "tuned", lambda self, scene: {"power": powers})
+    assert "own" in default_methods(small())
+    kind = Method.named("own+uncorrected")
+    tuned = tuned_values(kind, BRIGHT)
+    # Two steps beyond each end, as far as the option goes.
+    assert tuned["power"].values == pytest.approx((1.125, 1.5, 2.0, 3.0, 4.0, 5.0, 6.25, 7.8125))
+    assert tuned["power"].first == pytest.approx((1.5, 4.0, 6.25))
+    record = simulate_loop(BRIGHT, [with_choice(kind, BRIGHT, {LOOP_GAIN: 0.3, "power": 2.0})])
+    assert record.mean_strehl() > 0.35
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_first_values_are_among_all(name: str) -> None:
+    for each in tuned_values(Method.named(name), small()).values():
+        assert set(each.first) <= set(each.values)
+        assert list(each.values) == sorted(set(each.values))
+
+
+def test_unknown_methods_and_missing_values() -> None:
+    with pytest.raises(InputError, match=r"^estimator = 'kog': expected one of 'brightest'"):
+        Method.named("kog")
+    with pytest.raises(InputError, match=r"method = 'tv.predicted': expected an estimator that takes"):
+        Method.named("tv+predicted")
+    with pytest.raises(InputError, match="expected a value for 'keep_brightest' of the method 'brightest'"):
+        with_choice(Method.named("brightest"), small(), {LOOP_GAIN: 0.5})

@@ -8,7 +8,7 @@ from tests.experiments.experiment_cases import SEARCH, small
 
 from faintspot.base.errors import InputError
 from faintspot.experiments.closed_loop import search as tuning
-from faintspot.experiments.closed_loop.methods import LOOP_GAIN, tuned_values
+from faintspot.experiments.closed_loop.results import LOOP_GAIN, tuned_values
 from faintspot.experiments.closed_loop.search import (
     FIRST_TUNING_REALISATION,
     Search,

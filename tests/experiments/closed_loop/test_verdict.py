@@ -6,19 +6,22 @@ import numpy as np
 import pytest
 from tests.experiments.result_cases import LABELS, made_up_magnitude
 
+from faintspot.base.report.page import FigureWithData
 from faintspot.experiments.closed_loop.magnitude import save_recommended
 from faintspot.experiments.closed_loop.results import MagnitudeResult
 from faintspot.experiments.closed_loop.verdict import (
     NOWHERE,
     better_and_worse,
     equal_methods,
+    loop_page,
     loop_summary,
     loop_verdict,
+    loop_warnings,
     options_that_may_pay,
     reference_methods,
     tv_method,
 )
-from faintspot.loop.simulation.configuration.configuration import load_loop
+from faintspot.loop.simulation.configuration import load_loop
 from faintspot.slopes.pipeline.settings import Settings
 
 pytest.importorskip("hcipy")
@@ -142,3 +145,48 @@ def test_what_is_recommended_for_the_star_is_written(tmp_path: Path) -> None:
     assert (settings.estimator.name, settings.window_fwhm_px) == ("window", 3.0)
     assert load_loop(beside).control.gain == 0.3
     assert load_loop(beside).photons == pytest.approx(loop.photons)
+
+
+pytest.importorskip("hcipy")
+
+
+@pytest.mark.usefixtures("undrawn_pictures")
+def test_the_page_holds_everything() -> None:
+    page = loop_page(made_up_magnitude())
+    text = page.html()
+    assert "limiting magnitude" in text
+    for bad in ("nan", "None", "{{"):
+        assert f">{bad}" not in text
+    parts = [part for section in page.sections for part in section.parts]
+    (figure,) = (part for part in parts if isinstance(part, FigureWithData))
+    assert figure.csv.count("\n") == 1 + (4 + 3) * 5
+
+
+@pytest.mark.usefixtures("undrawn_pictures")
+def test_the_page_says_when_tv_gains_nothing() -> None:
+    page = loop_page(made_up_magnitude(-0.3)).html()
+    assert NOWHERE in page
+
+
+@pytest.mark.usefixtures("undrawn_pictures")
+def test_unfinished_results_make_a_page() -> None:
+    whole = made_up_magnitude()
+    strehl = whole.strehl.copy()
+    strehl[1, 2:] = np.nan
+    strehl[3] = np.nan
+    results = dataclasses.replace(whole, strehl=strehl)
+    assert "runs are still missing" in loop_warnings(results)[0]
+    page = loop_page(results).html()
+    assert ">nan" not in page
+    nothing = dataclasses.replace(whole, strehl=np.full_like(strehl, np.nan))
+    assert ">nan" not in loop_page(nothing).html()
+
+
+def test_few_realisations_are_warned_of() -> None:
+    lines = loop_warnings(made_up_magnitude(realisations=2))
+    assert any("fewer than 5" in line for line in lines)
+
+
+def test_sections_have_different_names() -> None:
+    names = [section.name for section in loop_page(made_up_magnitude()).sections]
+    assert len(set(names)) == len(names)

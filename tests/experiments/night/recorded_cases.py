@@ -7,11 +7,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from faintspot.engine.telemetry.recorder import TelemetryStore
 from faintspot.engine.telemetry.ring import image_type, layout_values, record_type
-from faintspot.io.telemetry.writing import TelemetryStore
-from faintspot.loop.control.configuration import Control
+from faintspot.loop.control.configuration import Control, packed_control
 from faintspot.loop.control.options import ControlOptions
-from faintspot.loop.control.recorded import packed_control
 from faintspot.slopes.sensor.layout import Layout
 
 BEGIN_S = 1.7e9

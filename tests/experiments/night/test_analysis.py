@@ -8,6 +8,9 @@ from tests.experiments.night_cases import BLOCK_S, night_with, without_r0
 from faintspot.experiments.night.analysis import (
     ALL_STRENGTHS,
     BEST,
+    FAILS,
+    HOLDS,
+    OPEN,
     by_strength,
     contrast,
     differences,
@@ -16,6 +19,7 @@ from faintspot.experiments.night.analysis import (
     groups,
     hours_needed,
     lines,
+    verdicts,
 )
 
 
@@ -179,3 +183,73 @@ def test_means_of_sets_and_of_all() -> None:
     assert of_all[0] == pytest.approx(night.strehl[rows].mean())
     assert of_all[1] == pytest.approx(night.strehl[rows].std(ddof=1))
     assert of_sets[1][0] == pytest.approx(night.strehl[rows & (night.set_number == 1)].mean())
+
+
+def test_a_shared_error_widens_intervals_and_does_not_fall_with_time() -> None:
+    night = night_with(effect=0.05)
+    before = differences(night)[0]
+    shared = np.where(night.method == night.reference, 0.0, 0.01)
+    after = differences(replace(night, shared_error=shared))[0]
+    assert after.measured.value == before.measured.value
+    assert after.measured.standard_error == pytest.approx(math.hypot(before.measured.standard_error, 0.01))
+    assert after.measured.high - after.measured.value == pytest.approx(
+        math.hypot(before.measured.high - before.measured.value, 1.96 * 0.01)
+    )
+    assert after.hours_needed > before.hours_needed
+    too_much = differences(replace(night, shared_error=3 * shared))[0]
+    assert too_much.shared_error == pytest.approx(0.03)
+
+
+def test_hours() -> None:
+    assert hours_needed(0.03, 0.02, 1.0) == pytest.approx(4.0)
+    assert hours_needed(0.03, math.hypot(0.02, 0.006), 1.0, shared_error=0.006) == pytest.approx(6.25)
+    assert hours_needed(0.03, 0.02, 1.0, shared_error=0.01) == math.inf
+    assert hours_needed(0.0, 0.02, 1.0) == math.inf
+
+
+def outcomes(*arguments: int, **options: float) -> list[tuple[str, str]]:
+    found = verdicts(night_with(*arguments, **options))  # type: ignore[arg-type]
+    return [(each.outcome, each.paired_outcome) for each in found]
+
+
+def test_a_night_that_confirms_the_paper() -> None:
+    assert outcomes(1, effect=0.2, best=0.2) == [(HOLDS, HOLDS)] * 3 + [(HOLDS, "")]
+
+
+def test_a_night_that_contradicts_it() -> None:
+    assert outcomes(1, effect=-0.2, best=-0.2)[:3] == [(FAILS, FAILS)] * 3
+
+
+def test_a_small_effect_is_not_decided_by_alternation_but_by_the_same_turbulence() -> None:
+    (every, *_) = verdicts(night_with(0, effect=-0.02))
+    assert (every.outcome, every.paired_outcome) == (OPEN, FAILS)
+    assert abs(every.significance) < 3
+    assert every.hours_needed > 2 * night_with(0).hours
+
+
+def test_best_strengths_are_compared_with_all_others() -> None:
+    """The others are the 32 blocks of TV outside the range, not the reference."""
+    night = night_with(2, effect=0.1, best=0.2)
+    _, _, found, line = verdicts(night)
+    for estimate in (found.measured, found.paired):
+        assert abs(estimate.value - 0.2) < 3 * estimate.standard_error
+    assert found.paired.standard_error < 0.02  # noise of 0.028 in each of 12 and of 32 blocks
+    assert found.significance == pytest.approx(found.measured.value / found.measured.standard_error)
+    hours = 44 * BLOCK_S / 3600
+    error = found.measured.standard_error
+    assert found.hours_needed == pytest.approx(hours * (3 * error / found.paired.value) ** 2)
+    slope = lines(night)[0].slope_per_m
+    needed = 68 * BLOCK_S / 3600 * (3 * slope.standard_error / slope.value) ** 2
+    assert line.hours_needed == pytest.approx(needed)
+    assert line.unit == " per cm"
+
+
+def test_without_paired_runs_there_is_no_paired_verdict() -> None:
+    found = verdicts(night_with(3, effect=0.2, paired=False))
+    assert {each.paired_outcome for each in found} == {""}
+    assert found[0].outcome == HOLDS
+
+
+def test_a_night_without_strengths_has_no_verdicts() -> None:
+    night = night_with(4)
+    assert verdicts(replace(night, strength=np.full(len(night.strehl), np.nan))) == []

@@ -8,8 +8,8 @@ import pytest
 from tests.experiments.night_cases import night_with, without_r0
 
 from faintspot.experiments.night.analysis import differences
-from faintspot.experiments.night.blocks import load_night
 from faintspot.experiments.night.page import night_summary, night_summary_text, write_night
+from faintspot.experiments.night.protocol import load_night
 
 pytest.importorskip("matplotlib")
 pytest.importorskip("zarr")

@@ -6,7 +6,6 @@ import pytest
 from tests.experiments.night_cases import night_with
 
 from faintspot.base.statistics import Estimate
-from faintspot.experiments.night.blocks import Night
 from faintspot.experiments.night.paper import (
     PAPER_MEANS,
     PAPER_SCATTERS,
@@ -17,7 +16,7 @@ from faintspot.experiments.night.paper import (
     paper_exposures,
     set_differences,
 )
-from faintspot.experiments.night.protocol import NightPlan
+from faintspot.experiments.night.protocol import Night, NightPlan
 
 PAPER_PLAN = NightPlan(gap_frames=0)
 

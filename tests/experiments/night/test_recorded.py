@@ -22,8 +22,8 @@ from tests.refusals import refused
 
 from faintspot.base.report.page import Table
 from faintspot.experiments.night.analysis import difference, drift_of_r0, groups
-from faintspot.experiments.night.measured_strehl import MeasuredStrehl, read_strehl
 from faintspot.experiments.night.recorded import alternates, recorded_night
+from faintspot.experiments.night.recorded_methods import MeasuredStrehl, read_strehl
 from faintspot.experiments.night.recorded_page import (
     page_of_recording,
     phase_differences,

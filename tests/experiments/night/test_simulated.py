@@ -6,8 +6,7 @@ import pytest
 from tests.experiments.experiment_cases import HERE, StopsAfter, assert_same_units, small
 
 from faintspot.base.errors import InputError
-from faintspot.experiments.night.blocks import load_night
-from faintspot.experiments.night.protocol import NightPlan
+from faintspot.experiments.night.protocol import NightPlan, load_night
 from faintspot.experiments.night.simulated import r0_of_slopes, run_night
 from faintspot.experiments.running import WorkerPool
 from faintspot.loop.simulation import simulate_loop

@@ -16,7 +16,7 @@ from faintspot.experiments.study.specification import paper_study
 pytest.importorskip("xarray")
 
 from faintspot.experiments import StudySpecification, Sweep, WorkerPool, run
-from faintspot.experiments.paper.whole import gains_by_mode
+from faintspot.experiments.paper.claims import gains_by_mode
 
 HOLDS, IN_PART, FAILS = Outcome.HOLDS, Outcome.IN_PART, Outcome.FAILS
 

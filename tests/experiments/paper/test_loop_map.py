@@ -10,7 +10,7 @@ from faintspot.base.report.page import Table
 from faintspot.experiments.closed_loop.results import MagnitudeResult
 from faintspot.experiments.paper import loop_map
 from faintspot.experiments.paper.loop_map import METHODS, R0_M, cells_of, loop_map_page, run_loop_map
-from faintspot.loop.simulation.configuration.configuration import LoopConfiguration
+from faintspot.loop.simulation.configuration import LoopConfiguration
 
 FLUXES = np.array([10.0, 100.0])
 SCATTER = np.array([-0.02, 0.01, 0.0, 0.01])  # of the turbulence, common to all methods

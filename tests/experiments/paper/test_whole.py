@@ -6,7 +6,7 @@ from tests.experiments.study_cases import dataset, power_law
 
 from faintspot.base.report.page import Table, TableCell
 from faintspot.experiments.night.analysis import OPEN
-from faintspot.experiments.paper.whole import (
+from faintspot.experiments.paper.claims import (
     FAILS,
     HOLDS,
     HOLDS_IF,

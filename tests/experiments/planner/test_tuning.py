@@ -12,8 +12,7 @@ from tests.experiments.planner_cases import CAMERA, QUICK, answered
 from faintspot.base.errors import InputError
 from faintspot.experiments import Question, tune
 from faintspot.experiments.methods import method_for_scene
-from faintspot.experiments.planner.question import Recorded
-from faintspot.experiments.planner.simulated import SPOTS_PER_FRAME, SimulatedSpots
+from faintspot.experiments.planner.question import SPOTS_PER_FRAME, Recorded, SimulatedSpots
 from faintspot.experiments.planner.tuning import _bound, _error_scale, _ranked
 from faintspot.slopes.estimators import Estimator, Scene, estimators, registry
 

@@ -15,11 +15,11 @@ from tests.refusals import refused
 
 from faintspot.base.flags import VARIABLES
 from faintspot.io import open_frames
-from faintspot.io.arrays.fits_units import StreamedArray
-from faintspot.io.arrays.stored_array import StoredArray
+from faintspot.io.fits_units import StreamedArray
 from faintspot.io.formats import registry
 from faintspot.io.formats.file_format import FileFormat
-from faintspot.io.stored.slopes_format import StoredSlopes
+from faintspot.io.slopes_format import StoredSlopes
+from faintspot.io.stored_array import StoredArray
 
 
 class Plain(FileFormat):

@@ -1,5 +1,6 @@
 """[control] of faintspot.toml: what is refused, in one line that says where."""
 
+import json
 import re
 from pathlib import Path
 from typing import Any
@@ -7,10 +8,17 @@ from typing import Any
 import numpy as np
 import pytest
 from tests.loop.control.control_cases import INTERACTION
+from tests.loop.telemetry.alternation_cases import MATRIX
 from tests.refusals import refused
 
 from faintspot.base.errors import InputError
-from faintspot.loop.control.configuration import Control, load_control, save_control
+from faintspot.loop.control.configuration import (
+    Control,
+    load_control,
+    packed_control,
+    save_control,
+    unpacked_control,
+)
 from faintspot.loop.control.options import ControlOptions
 from faintspot.slopes.pipeline import configuration as configuration_file
 from faintspot.slopes.sensor.layout import Layout
@@ -91,3 +99,31 @@ def test_another_sensor_is_refused() -> None:
     expected = "expected 32 rows for 16 sub-apertures (all x, then all y), got 18"
     with pytest.raises(InputError, match=re.escape(expected)):
         control.check_fits(len(Layout.grid((4, 4), pixels=8)))
+
+
+def test_matrix_and_options_are_read_as_they_were_written() -> None:
+    options = ControlOptions(gain=0.3, delay_frames=3, centroid_gain=0.8, largest_command=500.0)
+    packed = json.loads(json.dumps(packed_control(Control(MATRIX, options=options))))
+    found = unpacked_control({"control": packed})
+    assert found is not None
+    np.testing.assert_allclose(found.interaction, MATRIX, rtol=1e-6)
+    assert found.options == options
+
+
+def test_what_is_not_recorded() -> None:
+    assert packed_control(None) is None
+    assert unpacked_control({}) is None
+    assert unpacked_control({"control": None}) is None
+    large = Control(np.vstack([np.eye(400), np.zeros((400, 400))]))
+    assert large.interaction.size * 4 > 1 << 20
+    assert packed_control(large) is None
+
+
+@pytest.mark.parametrize(
+    "damage", [{"interaction_matrix": "?"}, {"shape": [3, 5]}, {"gain": 7}, {"unknown": 1}]
+)
+def test_damage_is_refused(damage: dict[str, object]) -> None:
+    packed = packed_control(Control(MATRIX))
+    assert packed is not None
+    with refused("control: the recorded control is damaged"):
+        unpacked_control({"control": {**packed, **damage}})

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.loop.simulation.telescope.mirror import DeformableMirror, PupilAmplitude
+from faintspot.loop.simulation.wavefront_sensor import DeformableMirror, PupilAmplitude
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,7 +2,7 @@
 
 import faintspot as fs
 from faintspot.loop.simulation import LoopConfiguration, Method
-from faintspot.loop.simulation.configuration.sections import Camera
+from faintspot.loop.simulation.sections import Camera
 
 PLAIN = fs.Settings("brightest", keep_brightest=80)
 

@@ -6,7 +6,7 @@ from tests.experiments.experiment_cases import small
 
 import faintspot as fs
 from faintspot.base.errors import InputError
-from faintspot.experiments.closed_loop.methods import LOOP_GAIN, NOISE_SCALE, tuned_values, with_choice
+from faintspot.experiments.closed_loop.results import LOOP_GAIN, NOISE_SCALE, tuned_values, with_choice
 from faintspot.loop.control.base import CONTROLS, INTEGRATOR
 from faintspot.loop.control.identification.loop_delay import LoopDelay
 from faintspot.loop.control.identification.open_loop import open_loop_of
@@ -14,7 +14,7 @@ from faintspot.loop.simulation import LoopConfiguration, Method, simulate_loop
 from faintspot.loop.simulation.engine_files import fixed_window
 from faintspot.loop.simulation.learning import learnt_control, recorded_loop
 from faintspot.loop.simulation.methods import PRIOR
-from faintspot.loop.simulation.telescope.model import prepare
+from faintspot.loop.simulation.telescope import prepare
 
 LEARNT = [kind for kind in CONTROLS if kind != INTEGRATOR]
 FAINT = (

@@ -6,10 +6,9 @@ from tests.loop.simulation.loop_cases import PLAIN, faint, plain, quiet
 import faintspot as fs
 from faintspot.base.errors import InputError
 from faintspot.loop.simulation import LoopRecord, Method, load_loop, simulate_loop
+from faintspot.loop.simulation.atmosphere import make_atmosphere
 from faintspot.loop.simulation.simulation import measure_gains
-from faintspot.loop.simulation.telescope.atmosphere import make_atmosphere
-from faintspot.loop.simulation.telescope.calibration import make_pipeline
-from faintspot.loop.simulation.telescope.model import prepare
+from faintspot.loop.simulation.telescope import make_pipeline, prepare
 
 pytest.importorskip("hcipy")
 

@@ -6,8 +6,8 @@ import pytest
 from tests.loop.control.control_cases import COVARIANCES, TURBULENCE
 
 from faintspot.loop.simulation import LoopConfiguration
+from faintspot.loop.simulation.atmosphere import make_atmosphere
 from faintspot.loop.simulation.record import slope_turbulence
-from faintspot.loop.simulation.telescope.atmosphere import make_atmosphere
 from faintspot.loop.turbulence.slope_covariance import SlopeTurbulence
 from faintspot.slopes.spots.von_karman import SPECTRUM
 

@@ -13,10 +13,13 @@ from typing import Any, ClassVar
 import numpy as np
 import pytest
 from tests.refusals import refused
+from tests.shared_data import ROOT
 
 import faintspot as fs
 from faintspot.slopes.estimators import Estimator, estimator_named, estimators, register, registry
 from faintspot.slopes.estimators.built_in.gravity import BrightestPixels
+from faintspot.slopes.estimators.registry import all_tables
+from faintspot.slopes.pipeline.settings import SharedOptions
 
 BUILT_IN = [
     "brightest",
@@ -196,3 +199,13 @@ class TestInstalledPackages:
         installed(monkeypatch, Point(lambda: register(middle("ml"))))
         with refused("estimator 'middle' of the package spots", "has one of that name already"):
             fs.Settings("middle")
+
+
+PAGE = ROOT / "docs" / "configuration.md"
+
+
+def test_every_table_is_included() -> None:
+    text = PAGE.read_text(encoding="utf-8")
+    tables = {name for name, table in all_tables(SharedOptions).items() if "\n| `" in table} - {"estimators"}
+    assert {name for name in tables if f"{{include}} reference/options/{name}.md" not in text} == set()
+    assert "{include} reference/options/control.md" in text

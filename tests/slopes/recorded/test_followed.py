@@ -15,7 +15,7 @@ import faintspot as fs
 from faintspot.io import read_slopes
 from faintspot.slopes.pipeline import configuration
 from faintspot.slopes.recorded import measure_recorded
-from faintspot.slopes.recorded.report.stored import report_of_stored
+from faintspot.slopes.recorded.stored import report_of_stored
 
 pytestmark = pytest.mark.usefixtures("undrawn_pictures")
 

@@ -10,8 +10,10 @@ import click
 from faintspot.cli.shared.needs import needs_linux
 
 _MODULES = {
-    **{name: name for name in ("calibrate", "demo", "learn", "record", "run", "telescope")},
-    **dict.fromkeys(("load", "send", "status", "stop", "unload"), "control"),
+    **dict.fromkeys(("calibrate", "learn"), "learn"),
+    **dict.fromkeys(("demo", "telescope"), "telescope"),
+    "run": "run",
+    **dict.fromkeys(("load", "record", "send", "status", "stop", "unload"), "control"),
     **dict.fromkeys(("bridge", "replay"), "sources"),
 }
 """Modules of the commands."""

@@ -1,15 +1,16 @@
-"""faintspot realtime learn: control that learns from a recording of the closed loop."""
+"""faintspot realtime calibrate and learn: the mirror measured by pokes, control learnt from a recording."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import click
 
-from faintspot.base.errors import InputError, require_linux
+from faintspot.base.errors import InputError, MissingExtraError, require_linux
 from faintspot.base.files import derived
-from faintspot.cli.shared.commands import ENGINE_NAME, configuration_option, option
+from faintspot.cli.shared.commands import ENGINE_NAME, configuration_option, name_option, option
 from faintspot.cli.shared.needs import needs
 from faintspot.cli.shared.progress import progress_bar
 
@@ -115,3 +116,120 @@ def _learn_from(store: Path, config: str, winds: str, layers: tuple[tuple[float,
     )
     click.echo(f"{unknown}; the centroid gain of [control] is used" if unknown else delay.gain_summary)
     click.echo(f"{learnt.description}; {path} and [control] of {config} written")
+
+
+@needs("realtime", "pyshmem")
+@click.command("calibrate", short_help="Measure interaction matrix and reference slopes.")
+@configuration_option("Configuration that gets [control].")
+@name_option("Name of the engine and the streams.")
+@option(
+    "--actuators",
+    type=click.IntRange(1),
+    metavar="N",
+    help="Actuators of the mirror.",
+    show_default="as before, or as simulated",
+)
+@option("--amplitude", type=float, default=50.0, help="Amplitude of a poke, in the mirror's unit.")
+@option(
+    "--error",
+    type=click.FloatRange(0, 1, min_open=True),
+    default=0.05,
+    help="Relative error of an actuator's slopes that half of the actuators must reach.",
+)
+@option("--rounds", type=click.IntRange(4), default=100, help="Most rounds.")
+@option("--settle-frames", type=click.IntRange(1), default=3, help="Frames until a command acts.")
+@option("--keep-reference", is_flag=True, help="Leave the reference slopes as they are.")
+def calibrate(
+    config: str,
+    name: str,
+    actuators: int | None,
+    amplitude: float,
+    error: float,
+    rounds: int,
+    keep_reference: bool,
+    **averaging: int,
+) -> None:
+    """Poke the mirror up and down and measure what the slopes do, for [control] of the configuration.
+
+    Pokes go out as the pyshmem stream NAME_commands, which the mirror must follow; a running engine without
+    control (`run --no-control`) measures. Every actuator is poked in every round, until the errors, from the
+    scatter between rounds, are small enough. A mirror that does not answer, and pokes that saturate, are
+    refused. Writes TOML's name with .control.npz and .control.png, and [control] into it. Best with light
+    that does not pass through moving air.
+
+    \b
+    Example:
+      faintspot realtime run --no-control
+      faintspot realtime calibrate --amplitude 50 --error 0.03
+    """
+    import numpy as np
+
+    from faintspot.engine.poking import StreamedMirror
+    from faintspot.loop.control.configuration import load_control
+    from faintspot.loop.control.mirror_calibration import (
+        calibrate_mirror,
+        centroid_gain,
+        save_calibration,
+        save_picture,
+    )
+    from faintspot.slopes.pipeline.configuration import Configuration
+
+    described = Configuration(config)
+    layout, former = described.layout, load_control(described)
+    if keep_reference and (former is None or former.reference is None):
+        raise InputError(f"--keep-reference: expected reference_slopes in [control] of {config}")
+    stroke = None if former is None else former.options.largest_command
+    if stroke is not None and amplitude > stroke:
+        raise InputError(f"--amplitude {amplitude:g}: expected at most largest_command, {stroke:g}")
+    number = actuators or _known_commands(former, name)
+    with (
+        StreamedMirror(name, number, **averaging) as mirror,
+        progress_bar("pokes", "rounds") as advance,
+    ):
+        total: Any = None
+        found = calibrate_mirror(mirror, amplitude, error, rounds, lambda done, _: advance(done, total))
+    reference = former.reference if keep_reference and former else mirror.reference + found.reference
+    if len(reference) != len(found.reference):
+        raise InputError(f"{config}: {len(reference) // 2} sub-apertures, the engine's has another number")
+    store = save_calibration(config, found, np.asarray(reference))
+    written = [str(store)]
+    try:
+        save_picture(derived(store, ".png"), found, np.asarray(reference), layout)
+        written.append(derived(store, ".png").name)
+    except MissingExtraError as error:
+        click.echo(f"no picture: {error}", err=True)
+    for line in _in_words(found):
+        click.echo(line)
+    if former is not None and former.interaction.shape == found.interaction.shape:
+        gain, gain_error = centroid_gain(found, former.interaction)
+        click.echo(f"slopes are {gain:.3f} +- {gain_error:.3f} times those of the former matrix")
+    click.echo(f"{', '.join(written)} and [control] of {config} written")
+
+
+def _known_commands(former: Any, name: str) -> int:
+    """Return the number of commands of the former calibration, or of a simulated telescope."""
+    from faintspot.engine.requests import TELESCOPE, request, socket_path
+
+    if former is not None:
+        return int(former.commands)
+    try:
+        return int(request(socket_path(name, TELESCOPE), "status")["commands"]["length"])
+    except InputError:
+        raise InputError("--actuators: expected the number of actuators of the mirror, got none") from None
+
+
+def _in_words(found: Any) -> list[str]:
+    """Describe the calibration."""
+    import numpy as np
+
+    slopes, commands = found.interaction.shape
+    lines = [
+        f"{commands} commands, {slopes} slopes, {found.rounds} rounds of +-{found.amplitude:g}; relative "
+        f"error {np.median(found.relative_error):.3f}; pokes of half as much: {found.linearity:.3f} of what "
+        "is in proportion"
+    ]
+    silent = np.flatnonzero(~found.answers)
+    if len(silent):
+        shown = ", ".join(map(str, silent[:20])) + (", ..." if len(silent) > 20 else "")
+        lines.append(f"{len(silent)} commands without an answer, not used: {shown}")
+    return lines

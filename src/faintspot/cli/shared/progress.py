@@ -24,9 +24,9 @@ from faintspot.base.errors import present
 from faintspot.cli.shared.commands import option
 
 if TYPE_CHECKING:
-    from faintspot.experiments.night.blocks import Night
+    from faintspot.experiments.night.protocol import Night
     from faintspot.experiments.running import WorkerPool
-    from faintspot.loop.simulation.configuration.configuration import LoopConfiguration
+    from faintspot.loop.simulation.configuration import LoopConfiguration
 
 
 _SPEED_OVER_S = 120.0  # work of several kinds is done in turns

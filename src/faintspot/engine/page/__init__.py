@@ -1,5 +1,5 @@
 """Web page of a running engine or a recording. Read in this order.
 
-`page_state` (new data, and what is shown of them), `engine_source` (an engine or a recording), `status`,
-`page` (updates), `client_requests`, `server`, `demonstration`.
+`page_state` (new data, and what is shown of them), `engine_source` (an engine or a recording), `page`
+(updates and status), `client_requests`, `server`, `demonstration`.
 """

@@ -14,7 +14,7 @@ from typing import Any, Protocol
 
 from faintspot.base.errors import InputError
 from faintspot.base.tables import parse_changes, parse_ranges
-from faintspot.engine.requests.requests import LENGTHY_TIMEOUT_S, request, since, socket_path
+from faintspot.engine.requests import LENGTHY_TIMEOUT_S, request, since, socket_path
 from faintspot.engine.telemetry.recorder import Recorder
 
 ClientRequest = Callable[[dict[str, Any]], Mapping[str, Any]]

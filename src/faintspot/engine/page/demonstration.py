@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 
 from faintspot.base.errors import InputError
 from faintspot.base.files import Closing, derived, output_errors, write_atomically
-from faintspot.engine.loop.control_loop import CLOSED, STATES
+from faintspot.engine.child_processes import ONE_THREAD, ChildProcesses
+from faintspot.engine.control_loop import CLOSED, STATES
 from faintspot.engine.pixels.readout import StopEvent
-from faintspot.engine.requests.child_processes import ONE_THREAD, ChildProcesses
-from faintspot.engine.requests.requests import LENGTHY_TIMEOUT_S, request, socket_path
+from faintspot.engine.requests import LENGTHY_TIMEOUT_S, request, socket_path
 from faintspot.engine.settings.interleaving import short_names
 from faintspot.engine.streams.stream import Follower
 from faintspot.engine.telemetry.numbers import MethodDifference, compared_methods
@@ -26,7 +26,7 @@ from faintspot.engine.telescope import TRUTH
 from faintspot.loop.control.base import KALMAN
 from faintspot.loop.control.configuration import save_control
 from faintspot.loop.control.options import TABLE
-from faintspot.loop.simulation.configuration.configuration import LoopConfiguration, load_loop
+from faintspot.loop.simulation.configuration import LoopConfiguration, load_loop
 from faintspot.loop.simulation.engine_files import CONFIGURATION, fixed_window, write_engine_files
 from faintspot.slopes.pipeline.configuration import Configuration, save
 from faintspot.slopes.pipeline.settings import Settings

@@ -18,7 +18,7 @@ from faintspot.engine.page.page_state import Batch, Floats, Picture
 from faintspot.engine.streams.stream import Follower
 from faintspot.engine.telemetry.ring import TelemetryRing, image_type, record_type
 from faintspot.engine.telescope import TRUTH
-from faintspot.io.telemetry.recording import StoredTelemetry, stored_names
+from faintspot.io.telemetry import StoredTelemetry, stored_names
 from faintspot.slopes.sensor.layout import Layout
 
 _STALE_S = 0.25  # between two checks whether the engine is alive

@@ -20,9 +20,8 @@ from faintspot.base.errors import InputError, MissingExtraError
 from faintspot.base.text_files import parse_json, to_json
 from faintspot.engine.page.client_requests import Access, ClientRequests, EngineRequests, answered
 from faintspot.engine.page.engine_source import EngineSource, RecordingSource
-from faintspot.engine.page.page import UPDATE_S, LatestMessages, Page, packed
+from faintspot.engine.page.page import UPDATE_S, LatestMessages, Page, StatusPoller, packed
 from faintspot.engine.page.page_state import BatchSource
-from faintspot.engine.page.status import StatusPoller
 from faintspot.engine.pixels.readout import StopEvent
 
 try:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.engine.path.frame_path import FramePath
-from faintspot.io.frame_numbers import left_out
+from faintspot.io.telemetry import left_out
 
 _BITS = 7  # 2^7 bins in every factor of 2: each is at most 1/128 of its value wide
 _LONGEST_NS = 2**37 - 1  # 137 s; longer durations count in the last bin

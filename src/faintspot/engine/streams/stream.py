@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from faintspot.engine.streams.image_layout import ISIO, IncompatibleStreamError, path_of
 from faintspot.engine.streams.image_stream import LARGEST_NUMBER, ImageStream, Publication
 from faintspot.engine.streams.shared_streams import lock_file, pyshmem_module
-from faintspot.io.frame_numbers import left_out
+from faintspot.io.telemetry import left_out
 
 _NAP_S = 5e-4
 

@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.statistics import Estimate, mean_by_blocks
-from faintspot.io.frame_numbers import all_left_out
-from faintspot.io.telemetry.recording import Telemetry
+from faintspot.io.telemetry import Telemetry, all_left_out
 
 Floats = NDArray[np.float64]
 

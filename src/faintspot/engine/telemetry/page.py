@@ -23,10 +23,9 @@ from faintspot.engine.telemetry.numbers import (
     restarts,
     timing,
 )
-from faintspot.io.telemetry.recording import Telemetry, read_telemetry
+from faintspot.io.telemetry import Telemetry, read_telemetry
 from faintspot.slopes.pipeline.slopes import Slopes
-from faintspot.slopes.recorded.report.page import slopes_sections, warnings_in_words
-from faintspot.slopes.recorded.report.run import SlopesRun
+from faintspot.slopes.recorded.page import SlopesRun, slopes_sections, warnings_in_words
 from faintspot.slopes.recorded.statistics import ARRAYS, MeasuredSlopes
 from faintspot.slopes.sensor.layout import Layout
 

@@ -23,7 +23,7 @@ from numpy.typing import ArrayLike, NDArray
 from faintspot.base.checks import number_between
 from faintspot.base.text_files import parse_json, plain_values, to_json
 from faintspot.engine.pixels.segment import CLOSED, Segment
-from faintspot.io.telemetry.recording import item_type
+from faintspot.io.telemetry import item_type
 from faintspot.slopes.kernels.compilation.ordered import fence, load, store
 from faintspot.slopes.pipeline.slopes import Slopes
 from faintspot.slopes.sensor.layout import Layout
@@ -129,7 +129,7 @@ class Described(TypedDict, total=False):
     parts: Mapping[str, str] | None
     """Calibration, PSF and score (`faintspot.slopes.pipeline.configuration.packed`)."""
     control: Mapping[str, object] | None
-    """Interaction matrix and options (`faintspot.loop.control.recorded.packed_control`)."""
+    """Interaction matrix and options (`faintspot.loop.control.configuration.packed_control`)."""
 
 
 class TelemetryRing(Segment):

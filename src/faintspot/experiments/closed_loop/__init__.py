@@ -1,5 +1,5 @@
 """Methods compared by the Strehl ratio of a simulated loop. Read in this order.
 
-`methods` (what is compared, and what is tuned), `search` (tuning), `magnitude` (tunes and
-scores at every flux), `results` (files and comparisons), `verdict` and `page` (their report).
+`results` (what is compared and tuned; files and comparisons), `search` (tuning), `magnitude` (tunes and
+scores at every flux), `verdict` (the report).
 """

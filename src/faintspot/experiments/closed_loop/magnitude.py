@@ -15,8 +15,12 @@ from faintspot.base.errors import InputError
 from faintspot.base.files import derived, write_atomically
 from faintspot.base.tables import save_tables
 from faintspot.base.text_files import parse_json, to_json
-from faintspot.experiments.closed_loop.methods import default_methods, tuned_values, with_choice
-from faintspot.experiments.closed_loop.results import MagnitudeResult
+from faintspot.experiments.closed_loop.results import (
+    MagnitudeResult,
+    default_methods,
+    tuned_values,
+    with_choice,
+)
 from faintspot.experiments.closed_loop.search import (
     QUICK,
     Search,
@@ -33,11 +37,11 @@ from faintspot.experiments.methods import Choice
 from faintspot.experiments.running import Advance, Unit, WorkerPool, in_stages, run_units
 from faintspot.experiments.store import UnitStore, ZarrStore, fingerprint_of
 from faintspot.loop.control.base import INTEGRATOR
-from faintspot.loop.simulation.configuration.configuration import LoopConfiguration
+from faintspot.loop.simulation.configuration import LoopConfiguration
 from faintspot.loop.simulation.methods import Method
 from faintspot.loop.simulation.record import MAGNITUDE_FILE, make_folder
 from faintspot.loop.simulation.simulation import simulate_loop
-from faintspot.loop.simulation.telescope.calibration import camera_calibration
+from faintspot.loop.simulation.telescope import camera_calibration
 from faintspot.slopes.estimators.base import Need
 from faintspot.slopes.estimators.built_in.gravity import BrightestPixels
 from faintspot.slopes.estimators.built_in.smoothed import Smoothed

@@ -14,11 +14,11 @@ from scipy.stats import theilslopes
 
 from faintspot.base.checks import number_between
 from faintspot.base.text_files import parse_json, to_json
-from faintspot.experiments.closed_loop.methods import LOOP_GAIN, Tunable, tuned_values, with_choice
+from faintspot.experiments.closed_loop.results import LOOP_GAIN, Tunable, tuned_values, with_choice
 from faintspot.experiments.methods import Choice
 from faintspot.experiments.running import Advance
 from faintspot.loop.control.base import INTEGRATOR
-from faintspot.loop.simulation.configuration.configuration import LoopConfiguration
+from faintspot.loop.simulation.configuration import LoopConfiguration
 from faintspot.loop.simulation.methods import Method
 from faintspot.loop.simulation.simulation import simulate_loop
 

@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from faintspot.base.report.texts import Texts
 from faintspot.base.statistics import Estimate
 from faintspot.experiments.night.alternation import coefficient, jackknife, predicted_by_others
-from faintspot.experiments.night.blocks import Night
-from faintspot.experiments.night.protocol import BEST_STRENGTHS
+from faintspot.experiments.night.protocol import BEST_STRENGTHS, Night
 
 Floats = NDArray[np.float64]
 Rows = NDArray[np.bool_]

@@ -36,15 +36,14 @@ from faintspot.experiments.night.analysis import (
     lines,
     verdicts,
 )
-from faintspot.experiments.night.blocks import NIGHT_STORE, Night
 from faintspot.experiments.night.paper import (
     PAPER_CORRELATION,
     PAPER_MEANS,
     compare_with_paper,
     paper_exposures,
 )
-from faintspot.experiments.night.protocol import COUNTS
-from faintspot.loop.simulation.configuration.configuration import LoopConfiguration
+from faintspot.experiments.night.protocol import COUNTS, NIGHT_STORE, Night
+from faintspot.loop.simulation.configuration import LoopConfiguration
 
 Floats = NDArray[np.float64]
 

@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 
 from faintspot.base.statistics import Estimate
 from faintspot.experiments.night.analysis import differences
-from faintspot.experiments.night.blocks import Night
-from faintspot.experiments.night.protocol import BEST_STRENGTHS, TV, NightPlan
+from faintspot.experiments.night.protocol import BEST_STRENGTHS, TV, Night, NightPlan
 
 Floats = NDArray[np.float64]
 

@@ -12,12 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.errors import InputError
-from faintspot.experiments.night.blocks import Night
-from faintspot.experiments.night.measured_strehl import MeasuredStrehl
-from faintspot.experiments.night.recorded_methods import RecordedMethods, conditions_of
+from faintspot.experiments.night.protocol import Night
+from faintspot.experiments.night.recorded_methods import MeasuredStrehl, RecordedMethods, conditions_of
 from faintspot.experiments.night.simulated import r0_of_slopes
-from faintspot.io.telemetry.recording import Telemetry, read_telemetry
-from faintspot.loop.control.recorded import RecordedControl
+from faintspot.io.telemetry import Telemetry, read_telemetry
+from faintspot.loop.control.configuration import RecordedControl
 from faintspot.loop.telemetry.alternation import (
     AlternatingLoop,
     RelativeGains,

@@ -10,14 +10,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.experiments.night.blocks import NIGHT_STORE, Night
-from faintspot.experiments.night.protocol import QUICK_PLAN, NightPlan, counts_per_e
+from faintspot.experiments.night.protocol import NIGHT_STORE, QUICK_PLAN, Night, NightPlan, counts_per_e
 from faintspot.experiments.running import Advance, Unit, WorkerPool, run_units
 from faintspot.experiments.store import UnitStore, ZarrStore, fingerprint_of
-from faintspot.loop.simulation.configuration.configuration import LoopConfiguration
-from faintspot.loop.simulation.configuration.sections import CLOSED
+from faintspot.loop.simulation.configuration import LoopConfiguration
 from faintspot.loop.simulation.methods import Method
 from faintspot.loop.simulation.record import LoopRecord, make_folder, slope_turbulence
+from faintspot.loop.simulation.sections import CLOSED
 from faintspot.loop.simulation.simulation import simulate_loop
 from faintspot.loop.turbulence.slope_covariance import SlopeTurbulence
 from faintspot.loop.turbulence.strength import turbulence_strength

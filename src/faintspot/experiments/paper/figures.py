@@ -12,8 +12,8 @@ from faintspot.base.report.page import FigureWithData
 from faintspot.base.report.plots import METHOD_COLOURS, WIDTH, Line, Panel, Picture
 from faintspot.base.report.texts import Texts
 from faintspot.experiments.methods import NO_TV, TV, knows_the_spot, label_of, style_of
-from faintspot.experiments.paper.claims import fixed_mode
-from faintspot.experiments.paper.whole import (
+from faintspot.experiments.paper.claims import (
+    fixed_mode,
     grouped,
     in_words,
     mode_in_words,
@@ -24,7 +24,7 @@ from faintspot.experiments.study.curves import kept_panels
 from faintspot.experiments.study.specification import BEST
 from faintspot.experiments.study.sweep import PARAMETERS
 from faintspot.slopes.estimators.algorithms.noise import suggested_strength, tv_denoise
-from faintspot.slopes.recorded.report.pictures import assembled
+from faintspot.slopes.recorded.pictures import assembled
 from faintspot.slopes.sensor.layout import Layout
 from faintspot.slopes.simulate import Detector, spots
 

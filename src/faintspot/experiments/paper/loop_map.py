@@ -19,7 +19,7 @@ from faintspot.experiments.closed_loop.search import QUICK, Search
 from faintspot.experiments.closed_loop.verdict import equal_methods
 from faintspot.experiments.methods import NO_TV, SMOOTHING, TV, label_of
 from faintspot.experiments.running import WorkerPool, in_stages
-from faintspot.loop.simulation.configuration.configuration import LoopConfiguration, load_loop
+from faintspot.loop.simulation.configuration import LoopConfiguration, load_loop
 from faintspot.loop.simulation.record import make_folder
 from faintspot.slopes.estimators.built_in.maximum_likelihood import MaximumAPosteriori
 from faintspot.slopes.estimators.built_in.window import Window

@@ -27,8 +27,8 @@ from faintspot.slopes.estimators.algorithms.noise import pixel_noise
 from faintspot.slopes.sensor.layout import Layout
 from faintspot.slopes.spots.psf import PSF
 from faintspot.slopes.spots.shapes import FWHM_OF_SIZE_1_PX
+from faintspot.slopes.training.centroid_gain import Images, SpotRange, spot_range
 from faintspot.slopes.training.psf_rounds import usable_subapertures
-from faintspot.slopes.training.search_range import Images, SpotRange, spot_range
 
 if TYPE_CHECKING:
     from faintspot.slopes.training.psf_learning import LearntPSF

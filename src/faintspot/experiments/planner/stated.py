@@ -14,7 +14,7 @@ from faintspot.base.errors import InputError
 from faintspot.base.options import Options, number, setting
 from faintspot.slopes.camera.calibration import Calibration
 from faintspot.slopes.camera.detector import Detector
-from faintspot.slopes.estimators.scene import PIXEL_BLUR_PX2
+from faintspot.slopes.estimators.sensor import PIXEL_BLUR_PX2
 from faintspot.slopes.sensor.window_checks import LARGEST_WINDOW, SMALLEST_WINDOW
 from faintspot.slopes.spots.psf import PSF
 from faintspot.slopes.spots.shapes import FWHM_OF_SIZE_1_PX, spots

@@ -24,8 +24,7 @@ from faintspot.experiments.methods import (
 )
 from faintspot.experiments.planner.answer import Answer, MethodResult
 from faintspot.experiments.planner.promise import Promise, check_promises
-from faintspot.experiments.planner.question import Question
-from faintspot.experiments.planner.simulated import SimulatedSpots, SpotFrames
+from faintspot.experiments.planner.question import Question, SimulatedSpots, SpotFrames
 from faintspot.loop.simulation.methods import Method
 from faintspot.slopes.estimators.base import Estimator
 from faintspot.slopes.estimators.built_in.gravity import BrightestPixels

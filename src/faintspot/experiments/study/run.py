@@ -24,7 +24,7 @@ from faintspot.experiments.store import (
 from faintspot.experiments.study.cell import measure_cell
 from faintspot.experiments.study.specification import StudySpecification
 from faintspot.experiments.study.sweep import PARAMETERS, RANGES, Cell
-from faintspot.io.locations import one_line
+from faintspot.io.stored_array import one_line
 
 if TYPE_CHECKING:
     import xarray

@@ -11,16 +11,15 @@ from numpy.typing import NDArray
 from faintspot.base.errors import InputError
 from faintspot.base.files import check_file_size, read_bytes
 from faintspot.base.flags import VARIABLES
-from faintspot.io.arrays.stored_array import MOST_WHOLE_BYTES, StoredArray
 from faintspot.io.formats.file_format import FileFormat
-from faintspot.io.locations import one_line
-from faintspot.io.stored.slopes_format import (
+from faintspot.io.slopes_format import (
     UNITS,
     ExistingOutput,
     StoredSlopes,
     most_slopes_bytes,
     with_absent,
 )
+from faintspot.io.stored_array import MOST_WHOLE_BYTES, StoredArray, one_line
 
 _LINES = 1 << 14
 _INDEX = ("frame", "subaperture")

@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import IO
 
 from faintspot.base.errors import InputError
-from faintspot.io.arrays.stored_array import StoredArray
-from faintspot.io.stored.slopes_format import ExistingOutput, StoredSlopes
+from faintspot.io.slopes_format import ExistingOutput, StoredSlopes
+from faintspot.io.stored_array import StoredArray
 
 
 class FileFormat:

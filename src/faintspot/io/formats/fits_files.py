@@ -16,26 +16,26 @@ from typing import IO, Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.base.errors import InputError
+from faintspot.base.errors import InputError, load_fits
 from faintspot.base.files import check_bytes
 from faintspot.base.flags import VARIABLES
 from faintspot.base.text_files import parse_json, to_json
-from faintspot.io.arrays.fits_tables import Column, ColumnValues, columns_of, is_table
-from faintspot.io.arrays.fits_units import (
+from faintspot.io.fits_units import (
     AOT_VERSION,
     GZIP_SIGNATURE,
+    Column,
+    ColumnValues,
     HeaderDataUnit,
     StreamedArray,
     check_present,
+    columns_of,
     is_gzip,
+    is_table,
     open_plain_or_gzip,
     units_of,
 )
-from faintspot.io.arrays.stored_array import StoredArray
 from faintspot.io.formats.file_format import FileFormat
-from faintspot.io.locations import one_line
-from faintspot.io.optional_packages import load_fits
-from faintspot.io.stored.slopes_format import (
+from faintspot.io.slopes_format import (
     COORDINATE_UNITS,
     REQUIRED,
     StoredSlopes,
@@ -44,6 +44,7 @@ from faintspot.io.stored.slopes_format import (
     unit_of,
     with_absent,
 )
+from faintspot.io.stored_array import StoredArray, one_line
 
 _BLOCK_BYTES, _PIECE_BYTES = 2880, 1 << 20
 
@@ -62,7 +63,7 @@ class Fits(FileFormat):
         the frames of the sensor `key`, by default of the only one.
         """
         if AOT_VERSION in next(units_of(path)).header:
-            from faintspot.io.telemetry.aot_reading import frames_of_aot
+            from faintspot.io.aot_reading import frames_of_aot
 
             names = {name for unit in units_of(path) for name in (unit.name.upper(), str(unit.index))}
             if key is None or key.strip().upper() not in names:

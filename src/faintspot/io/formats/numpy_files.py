@@ -16,11 +16,10 @@ from faintspot.base.errors import InputError
 from faintspot.base.files import check_regular, unpacked
 from faintspot.base.flags import VARIABLES
 from faintspot.base.text_files import parse_json, to_json
-from faintspot.io.arrays.fits_units import StreamedArray, check_present
-from faintspot.io.arrays.stored_array import MOST_WHOLE_BYTES, StoredArray
+from faintspot.io.fits_units import StreamedArray, check_present
 from faintspot.io.formats.file_format import FileFormat
-from faintspot.io.locations import PREFERRED_NAME, choose_name
-from faintspot.io.stored.slopes_format import REQUIRED, StoredSlopes, most_slopes_bytes, with_absent
+from faintspot.io.slopes_format import REQUIRED, StoredSlopes, most_slopes_bytes, with_absent
+from faintspot.io.stored_array import MOST_WHOLE_BYTES, PREFERRED_NAME, StoredArray, choose_name
 
 _PIECE_NUMBERS = 1 << 18
 

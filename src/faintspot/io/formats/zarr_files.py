@@ -7,14 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from faintspot.base.errors import InputError
-from faintspot.io.arrays.stored_array import StoredArray
-from faintspot.io.arrays.zarr_store import CheckedChunks, check_array, is_store, open_store
+from faintspot.base.errors import InputError, load_zarr
 from faintspot.io.formats.file_format import FileFormat
-from faintspot.io.locations import choose_name
-from faintspot.io.optional_packages import load_zarr
-from faintspot.io.stored.slopes_format import ExistingOutput, StoredSlopes
-from faintspot.io.stored.slopes_zarr import describe_store, read_store
+from faintspot.io.slopes_format import ExistingOutput, StoredSlopes
+from faintspot.io.slopes_zarr import describe_store, read_store
+from faintspot.io.stored_array import StoredArray, choose_name
+from faintspot.io.zarr_store import CheckedChunks, check_array, is_store, open_store
 
 
 class Zarr(FileFormat):

@@ -1,12 +1,13 @@
-"""Table [control] of faintspot.toml: controller, matrices and limits that turn slopes into commands."""
+"""Table [control] of faintspot.toml: controller, matrices and limits; their form in recordings."""
 
 from __future__ import annotations
 
+import base64
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,9 +18,17 @@ from faintspot.base.tables import Tables, save_tables
 from faintspot.base.text_files import check_keys
 from faintspot.loop.control.base import CONTROLS, INTEGRATOR, KALMAN, CommandDelayLine, Controller
 from faintspot.loop.control.integrator import CompiledIntegrator
-from faintspot.loop.control.options import BEYOND_ALL, CONTROLLER, NONE, STREAM, TABLE, ControlOptions
+from faintspot.loop.control.options import (
+    BEYOND_ALL,
+    CONTROLLER,
+    NONE,
+    STREAM,
+    TABLE,
+    TIP_TILT_FOCUS,
+    ControlOptions,
+    RemovedModes,
+)
 from faintspot.loop.control.reconstructor import Reconstructor, make_reconstructor
-from faintspot.loop.control.removed_modes import TIP_TILT_FOCUS, RemovedModes
 from faintspot.slopes.camera.calibration import Calibration
 from faintspot.slopes.pipeline.configuration import Configuration
 from faintspot.slopes.pipeline.settings import Settings
@@ -28,6 +37,7 @@ from faintspot.slopes.sensor.layout import Layout
 if TYPE_CHECKING:
     from faintspot.loop.control.identification.model import Kalman
     from faintspot.loop.control.integrator import LoopPlant
+
 
 Floats = NDArray[np.float64]
 
@@ -311,3 +321,42 @@ def save_control(path: str | Path, **values: object) -> None:
     path = Path(path)
     before = Tables(path).tables.get(TABLE, {}) if path.exists() else {}
     save_tables(path, {TABLE: {**before, **values}})
+
+
+_MOST_BYTES = 1 << 20
+_SHAPE, _TYPE = "shape", "<f4"
+
+
+class RecordedControl(NamedTuple):
+    """Control as a recording describes it."""
+
+    interaction: NDArray[np.float64]
+    """(2 n, commands): slopes [px] that one unit of each command adds."""
+    options: ControlOptions
+
+
+def packed_control(control: Control | None) -> dict[str, Any] | None:
+    """Return matrix and options as JSON values; None without control, or if they exceed 1 MiB."""
+    if control is None or control.interaction.size * np.dtype(_TYPE).itemsize > _MOST_BYTES:
+        return None
+    text = base64.b64encode(control.interaction.astype(_TYPE).tobytes()).decode()
+    return {INTERACTION: text, _SHAPE: list(control.interaction.shape), **control.options.chosen()}
+
+
+def unpacked_control(attributes: Mapping[str, Any]) -> RecordedControl | None:
+    """Return the control from the attributes of a recording; None where it is not recorded.
+
+    Raises
+    ------
+    InputError
+        When it is damaged.
+    """
+    if not attributes.get(TABLE):
+        return None
+    try:
+        options = dict(attributes[TABLE])
+        values = np.frombuffer(base64.b64decode(options.pop(INTERACTION), validate=True), _TYPE)
+        matrix = values.reshape(options.pop(_SHAPE)).astype(np.float64)
+        return RecordedControl(matrix, ControlOptions(**options))
+    except (KeyError, TypeError, ValueError) as error:  # InputError is a ValueError
+        raise InputError(f"{TABLE}: the recorded control is damaged ({error})") from None

@@ -7,19 +7,19 @@ from typing import TYPE_CHECKING
 from faintspot.base.errors import lazy_attributes
 
 if TYPE_CHECKING:
-    from faintspot.loop.simulation.configuration.configuration import LoopConfiguration as LoopConfiguration
-    from faintspot.loop.simulation.configuration.configuration import load_loop as load_loop
-    from faintspot.loop.simulation.configuration.configuration import shipped_loops as shipped_loops
+    from faintspot.loop.simulation.configuration import LoopConfiguration as LoopConfiguration
+    from faintspot.loop.simulation.configuration import load_loop as load_loop
+    from faintspot.loop.simulation.configuration import shipped_loops as shipped_loops
     from faintspot.loop.simulation.methods import Method as Method
     from faintspot.loop.simulation.record import LoopRecord as LoopRecord
     from faintspot.loop.simulation.simulation import simulate_loop as simulate_loop
 
 _HOMES = {
     "Method": "faintspot.loop.simulation.methods",
-    "LoopConfiguration": "faintspot.loop.simulation.configuration.configuration",
+    "LoopConfiguration": "faintspot.loop.simulation.configuration",
     "LoopRecord": "faintspot.loop.simulation.record",
-    "load_loop": "faintspot.loop.simulation.configuration.configuration",
-    "shipped_loops": "faintspot.loop.simulation.configuration.configuration",
+    "load_loop": "faintspot.loop.simulation.configuration",
+    "shipped_loops": "faintspot.loop.simulation.configuration",
     "simulate_loop": "faintspot.loop.simulation.simulation",
 }
 

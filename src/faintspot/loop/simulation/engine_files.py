@@ -13,16 +13,16 @@ from faintspot.base.files import output_errors, write_atomically
 from faintspot.loop.control.base import INTEGRATOR, KALMAN
 from faintspot.loop.control.configuration import save_control
 from faintspot.loop.control.options import TABLE
-from faintspot.loop.simulation.configuration.configuration import LoopConfiguration
+from faintspot.loop.simulation.configuration import LoopConfiguration
 from faintspot.loop.simulation.learning import learnt_control
 from faintspot.loop.simulation.methods import PREDICTED, PRIOR, Method
 from faintspot.loop.simulation.simulation import measure_gains, simulate_loop
-from faintspot.loop.simulation.telescope.calibration import (
+from faintspot.loop.simulation.telescope import (
     camera_calibration,
     make_pipeline,
+    prepare,
     reference_slopes,
 )
-from faintspot.loop.simulation.telescope.model import prepare
 from faintspot.loop.turbulence.slope_covariance import ARCSEC
 from faintspot.slopes.pipeline import configuration as configuration_file
 from faintspot.slopes.pipeline.settings import Settings

@@ -17,11 +17,11 @@ from faintspot.loop.control.identification.loop_delay import LoopDelay
 from faintspot.loop.control.identification.model import Kalman
 from faintspot.loop.control.identification.open_loop import measured_delay, open_loop_of
 from faintspot.loop.control.identification.recording import Recording
-from faintspot.loop.simulation.configuration.configuration import LoopConfiguration
-from faintspot.loop.simulation.configuration.sections import CLOSED, ControlParameters, RunLength
+from faintspot.loop.simulation.configuration import LoopConfiguration
 from faintspot.loop.simulation.methods import PRIOR, TRUE, Method
 from faintspot.loop.simulation.record import LoopRecord, plant_of, slope_turbulence
-from faintspot.loop.simulation.telescope.model import prepare
+from faintspot.loop.simulation.sections import CLOSED, ControlParameters, RunLength
+from faintspot.loop.simulation.telescope import prepare
 from faintspot.loop.turbulence.slope_covariance import ARCSEC
 from faintspot.slopes.pipeline.configuration import to_text
 

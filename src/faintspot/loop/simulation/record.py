@@ -14,10 +14,10 @@ from faintspot.base.errors import InputError
 from faintspot.base.files import NpzFile
 from faintspot.loop.control.base import CommandDelayLine, Controller
 from faintspot.loop.control.integrator import Integrator
-from faintspot.loop.simulation.configuration.configuration import LoopConfiguration
-from faintspot.loop.simulation.configuration.sections import CLOSED
+from faintspot.loop.simulation.configuration import LoopConfiguration
 from faintspot.loop.simulation.methods import TRUE, WEIGHTED, Method
-from faintspot.loop.simulation.telescope.model import LoopOptics
+from faintspot.loop.simulation.sections import CLOSED
+from faintspot.loop.simulation.telescope import LoopOptics
 from faintspot.loop.turbulence.slope_covariance import SlopeTurbulence
 
 if TYPE_CHECKING:

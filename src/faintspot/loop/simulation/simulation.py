@@ -13,22 +13,20 @@ from numpy.typing import ArrayLike, NDArray
 from faintspot.base.checks import number_between, numbers_between
 from faintspot.base.errors import InputError
 from faintspot.loop.control.base import INTEGRATOR, CommandDelayLine
-from faintspot.loop.simulation.configuration.configuration import LoopConfiguration
-from faintspot.loop.simulation.configuration.sections import RunLength
+from faintspot.loop.simulation.configuration import LoopConfiguration
 from faintspot.loop.simulation.methods import TRUE, Method
 from faintspot.loop.simulation.record import LoopRecord, make_controller
-from faintspot.loop.simulation.telescope.calibration import (
+from faintspot.loop.simulation.sections import RunLength
+from faintspot.loop.simulation.telescope import (
+    TelescopeModel,
+    atmosphere_of,
     centroid_gain,
+    laser_source,
     make_detector,
     make_pipeline,
     mean_flux,
-    typical_spots,
-)
-from faintspot.loop.simulation.telescope.model import (
-    TelescopeModel,
-    atmosphere_of,
-    laser_source,
     prepare,
+    typical_spots,
     without_flux,
 )
 from faintspot.slopes.pipeline.configuration import to_text
@@ -38,8 +36,8 @@ from faintspot.slopes.pipeline.slopes import Slopes
 
 if TYPE_CHECKING:
     from faintspot.loop.control.identification.model import Kalman
-    from faintspot.loop.simulation.telescope.laser import LaserRun
-    from faintspot.slopes.training.known_sodium import KnownSodium
+    from faintspot.loop.simulation.laser import LaserRun
+    from faintspot.slopes.training.sodium import KnownSodium
 
 
 _MOST_METHODS = 127
@@ -325,7 +323,7 @@ def _laser_run(
     """Return what a run with a laser guide star adds; None without one."""
     if configuration.laser is None:
         return None
-    from faintspot.loop.simulation.telescope.laser import LaserRun, LowOrders
+    from faintspot.loop.simulation.laser import LaserRun, LowOrders
 
     known = _learnt_sodium(replace(configuration, name="-", run=RunLength()), seed, realisation)
     sensor = prepare(configuration).sensor
@@ -335,7 +333,7 @@ def _laser_run(
 
 @lru_cache(maxsize=4)
 def _learnt_sodium(configuration: LoopConfiguration, seed: int, realisation: int) -> KnownSodium:
-    from faintspot.loop.simulation.telescope.laser import learn_sodium
+    from faintspot.loop.simulation.laser import learn_sodium
 
     spots = np.concatenate(_typical_spots(without_flux(configuration), seed, realisation))
     return learn_sodium(configuration, prepare(configuration).sensor.layout, spots, seed)

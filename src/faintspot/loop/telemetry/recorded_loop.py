@@ -17,17 +17,15 @@ from faintspot.base.files import read_arrays
 from faintspot.base.flags import NO_FLAG, SubapertureFlag, leave_out
 from faintspot.base.text_files import check_keys, parse_file
 from faintspot.io import StoredSlopes
-from faintspot.io.arrays.fits_units import is_aot
-from faintspot.io.arrays.zarr_store import holds_telemetry
+from faintspot.io.fits_units import is_aot
 from faintspot.io.frames import read_array
-from faintspot.io.loops.layout_reading import read_layout
-from faintspot.io.loops.milk_streams import holds_streams, read_streams
-from faintspot.io.loops.pyrtc_session import holds_session, read_session
+from faintspot.io.loop_layouts import read_layout
+from faintspot.io.loop_streams import holds_session, holds_streams, read_session, read_streams
 from faintspot.io.slopes import holds_slopes
-from faintspot.io.telemetry.recording import read_telemetry
-from faintspot.loop.control.configuration import load_control
+from faintspot.io.telemetry import read_telemetry
+from faintspot.io.zarr_store import holds_telemetry
+from faintspot.loop.control.configuration import RecordedControl, load_control, unpacked_control
 from faintspot.loop.control.identification.recording import NUMBERS, Recording, cells_of
-from faintspot.loop.control.recorded import RecordedControl, unpacked_control
 from faintspot.loop.telemetry.recording import CLOSED
 from faintspot.loop.turbulence.slope_covariance import ARCSEC
 from faintspot.slopes.recorded.stored_run import open_run
@@ -243,7 +241,7 @@ def _proportional(stored: StoredSlopes) -> tuple[Floats, SubapertureFlag, float]
 
 
 def _of_aot(path: Path) -> dict[str, Any]:
-    from faintspot.io.telemetry.aot_reading import read_aot
+    from faintspot.io.aot_reading import read_aot
 
     sensor = read_aot(path)
     if sensor.slopes is None:

@@ -21,7 +21,7 @@ from faintspot.slopes.sensor.layout import Layout
 from faintspot.slopes.sensor.pupil import side_m
 
 if TYPE_CHECKING:
-    from faintspot.io.telemetry.recording import Telemetry
+    from faintspot.io.telemetry import Telemetry
 
 Floats = NDArray[np.float64]
 

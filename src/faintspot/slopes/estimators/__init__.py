@@ -19,14 +19,14 @@ if TYPE_CHECKING:
     from faintspot.slopes.estimators.registry import estimator_named as estimator_named
     from faintspot.slopes.estimators.registry import estimators as estimators
     from faintspot.slopes.estimators.registry import register as register
-    from faintspot.slopes.estimators.scene import Scene as Scene
+    from faintspot.slopes.estimators.sensor import Scene as Scene
     from faintspot.slopes.estimators.sensor import Sensor as Sensor
 
 _HOMES = {
     "Estimator": "faintspot.slopes.estimators.base",
     "Need": "faintspot.slopes.estimators.base",
     "Positions": "faintspot.slopes.estimators.base",
-    "Scene": "faintspot.slopes.estimators.scene",
+    "Scene": "faintspot.slopes.estimators.sensor",
     "Sensor": "faintspot.slopes.estimators.sensor",
     "Style": "faintspot.slopes.estimators.base",
     "estimator_named": "faintspot.slopes.estimators.registry",

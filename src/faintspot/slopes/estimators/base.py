@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 
 from faintspot.base.errors import InputError
 from faintspot.base.options import Options, is_auto
-from faintspot.slopes.estimators.scene import Scene
-from faintspot.slopes.estimators.sensor import Sensor
+from faintspot.slopes.estimators.sensor import Scene, Sensor
 from faintspot.slopes.kernels.driver.groups import COMMON_ROWS, flux_of_groups
 
 Floats = NDArray[np.float64]

@@ -13,7 +13,7 @@ from faintspot.base.checks import one_of
 from faintspot.base.errors import InputError, MissingExtraError
 from faintspot.base.flags import NO_FLAG, UNMEASURED, VARIABLES, SubapertureFlag, are_valid, scaled_positions
 from faintspot.io.formats.csv_files import column_name
-from faintspot.io.stored.slopes_format import COORDINATE_UNITS, UNITS, pixels_in, unit_of
+from faintspot.io.slopes_format import COORDINATE_UNITS, UNITS, pixels_in, unit_of
 from faintspot.slopes.sensor.layout import Layout
 
 if TYPE_CHECKING:

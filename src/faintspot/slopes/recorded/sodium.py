@@ -15,14 +15,14 @@ from faintspot.slopes.pipeline.following import measure_images
 from faintspot.slopes.pipeline.settings import Settings
 from faintspot.slopes.sensor.layout import Layout
 from faintspot.slopes.spots.laser_spots import LaserSpots
-from faintspot.slopes.training.known_sodium import (
+from faintspot.slopes.training.psf_rounds import usable_subapertures
+from faintspot.slopes.training.sodium import (
     IGNORED_E2,
     KnownSodium,
+    MeanImages,
     calibrated_images,
     dark_variance_e2,
 )
-from faintspot.slopes.training.psf_rounds import usable_subapertures
-from faintspot.slopes.training.sodium import MeanImages
 
 _BLOCK_FRAMES = 20
 _FITS = 2  # the first one finds the shape, with which the spots are located for the second

@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from faintspot.base.errors import InputError, errors_within
-from faintspot.io.arrays.fits_units import is_aot
+from faintspot.io.fits_units import is_aot
 from faintspot.io.frames import FrameSource
-from faintspot.io.locations import split_location
+from faintspot.io.stored_array import split_location
 from faintspot.slopes.camera.frame_checks import LargestValues, MeanFrame, are_repeated
 from faintspot.slopes.pipeline import configuration
 from faintspot.slopes.pipeline.configuration import Configuration
@@ -135,7 +135,7 @@ def configured(
     first = None if described is not None and "layout" in described else _aot_file(frames)
     if first is None:
         return described or Configuration(path), "", None
-    from faintspot.io.telemetry.aot_reading import read_aot  # only for such files
+    from faintspot.io.aot_reading import read_aot  # only for such files
 
     sensor = read_aot(first[0], first[1] or key)
     where = f"{first[0]}: sensor {sensor.name!r}"

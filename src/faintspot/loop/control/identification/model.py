@@ -17,7 +17,7 @@ from scipy import sparse
 from faintspot.base.checks import numbers_between, one_of
 from faintspot.base.errors import InputError
 from faintspot.base.files import read_arrays, save_arrays, write_atomically
-from faintspot.io.arrays.fits_units import write_images
+from faintspot.io.fits_units import write_images
 from faintspot.loop.control.base import (
     KALMAN,
     CommandDelayLine,

@@ -26,8 +26,7 @@ from faintspot.slopes.estimators.base import (
     Style,
 )
 from faintspot.slopes.estimators.registry import register
-from faintspot.slopes.estimators.scene import PIXEL_BLUR_PX2, Scene
-from faintspot.slopes.estimators.sensor import Sensor
+from faintspot.slopes.estimators.sensor import PIXEL_BLUR_PX2, Scene, Sensor
 from faintspot.slopes.kernels.gravity import gravity
 
 Floats = NDArray[np.float64]

@@ -17,8 +17,7 @@ from faintspot.base.tables import PRESETS
 from faintspot.slopes.estimators import spot_tables
 from faintspot.slopes.estimators.base import Estimator, Need, Style
 from faintspot.slopes.estimators.registry import register
-from faintspot.slopes.estimators.scene import Scene
-from faintspot.slopes.estimators.sensor import Sensor
+from faintspot.slopes.estimators.sensor import Scene, Sensor
 from faintspot.slopes.estimators.spot_tables import NO_POSTERIOR, PosteriorGrid, SpotModel, model_of_psf
 from faintspot.slopes.estimators.spots import SpotPlan, Stepping
 from faintspot.slopes.kernels.driver.groups import RANGE, flux_above_edges

@@ -14,8 +14,7 @@ from faintspot.slopes.estimators.algorithms.automatic import automatic_smoothing
 from faintspot.slopes.estimators.base import BACKGROUND, CALIBRATED, RAW, Step, Style
 from faintspot.slopes.estimators.built_in.gravity import BrightestPixels, GravityPlan, KeepingBrightest
 from faintspot.slopes.estimators.registry import register
-from faintspot.slopes.estimators.scene import Scene
-from faintspot.slopes.estimators.sensor import Sensor
+from faintspot.slopes.estimators.sensor import Scene, Sensor
 from faintspot.slopes.estimators.spot_tables import gaussian_taps
 from faintspot.slopes.kernels.gravity import gravity
 

@@ -13,8 +13,7 @@ from faintspot.base.options import Value, option
 from faintspot.slopes.estimators.base import Style
 from faintspot.slopes.estimators.built_in.gravity import Centroid, Floats, GravityPlan
 from faintspot.slopes.estimators.registry import register
-from faintspot.slopes.estimators.scene import Scene
-from faintspot.slopes.estimators.sensor import Sensor
+from faintspot.slopes.estimators.sensor import Scene, Sensor
 from faintspot.slopes.kernels.gravity import gravity
 
 _OF_NOISE = (3.0, 1.5, 2.0, 2.5, 4.0, 5.0)  # multiples of the noise of a dark pixel

@@ -23,8 +23,7 @@ from faintspot.slopes.estimators.built_in.gravity import (
     KeepingBrightest,
 )
 from faintspot.slopes.estimators.registry import register
-from faintspot.slopes.estimators.scene import Scene
-from faintspot.slopes.estimators.sensor import Sensor
+from faintspot.slopes.estimators.sensor import Scene, Sensor
 from faintspot.slopes.kernels.gravity import gravity
 from faintspot.slopes.kernels.total_variation.flat_start import flat_start_table
 

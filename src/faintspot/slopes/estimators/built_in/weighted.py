@@ -14,8 +14,7 @@ from faintspot.base.tables import PRESETS
 from faintspot.slopes.estimators import spot_tables
 from faintspot.slopes.estimators.base import Need, Style
 from faintspot.slopes.estimators.registry import register
-from faintspot.slopes.estimators.scene import Scene
-from faintspot.slopes.estimators.sensor import Sensor
+from faintspot.slopes.estimators.sensor import Scene, Sensor
 from faintspot.slopes.estimators.spot_tables import SpotModel
 from faintspot.slopes.estimators.spots import SpotPlan, Stepping
 from faintspot.slopes.kernels.spot_fits import fits as spot_fits

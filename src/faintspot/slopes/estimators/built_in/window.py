@@ -15,8 +15,7 @@ from faintspot.base.errors import InputError
 from faintspot.base.options import Value, option
 from faintspot.slopes.estimators.base import Estimator, EstimatorPlan, Need, Style
 from faintspot.slopes.estimators.registry import register
-from faintspot.slopes.estimators.scene import Scene
-from faintspot.slopes.estimators.sensor import Sensor
+from faintspot.slopes.estimators.sensor import Scene, Sensor
 from faintspot.slopes.estimators.spot_tables import gaussian_psf
 from faintspot.slopes.kernels.compilation.host import WIDTHS, lanes_for
 from faintspot.slopes.kernels.gravity import window

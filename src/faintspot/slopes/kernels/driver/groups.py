@@ -16,9 +16,8 @@ import numpy as np
 
 from faintspot.base.flags import SubapertureFlag
 from faintspot.slopes.kernels.compilation.compiling import compiled, compiled_with, inlined
-from faintspot.slopes.kernels.compilation.host import aligned_zeros
+from faintspot.slopes.kernels.compilation.host import aligned_zeros, flush_subnormals, restore_control
 from faintspot.slopes.kernels.compilation.simd import Lanes, load, maximum, select, splat, store, width_of
-from faintspot.slopes.kernels.compilation.subnormals import flush_subnormals, restore_control
 from faintspot.slopes.kernels.driver.gather import calibrate, fill_bad_pixels, gather_raw, scatter_images
 
 NO_FLUX = int(SubapertureFlag.NO_FLUX)

@@ -14,6 +14,7 @@ import numpy as np
 
 from faintspot.base.checks import LARGEST_FLOAT32
 from faintspot.slopes.kernels.compilation.compiling import compiled
+from faintspot.slopes.kernels.compilation.host import flush_subnormals, restore_control
 from faintspot.slopes.kernels.compilation.simd import (
     Lanes,
     absolute,
@@ -28,7 +29,6 @@ from faintspot.slopes.kernels.compilation.simd import (
     widened,
     width_of,
 )
-from faintspot.slopes.kernels.compilation.subnormals import flush_subnormals, restore_control
 from faintspot.slopes.kernels.driver import groups
 from faintspot.slopes.kernels.driver.groups import (
     COMMON_ROWS,

@@ -31,10 +31,8 @@ from faintspot.slopes.kernels.gravity.smoothing import (
 )
 from faintspot.slopes.kernels.spot_fits import spot_rows
 from faintspot.slopes.kernels.spot_fits.likelihood import fit_group
-from faintspot.slopes.kernels.spot_fits.posterior import posterior_of_group
-from faintspot.slopes.kernels.spot_fits.profiles import LEAST_FLUX_E, find_start
-from faintspot.slopes.kernels.spot_fits.spot_rows import subtract_background
-from faintspot.slopes.kernels.spot_fits.weighted import weigh_group
+from faintspot.slopes.kernels.spot_fits.means import posterior_of_group, weigh_group
+from faintspot.slopes.kernels.spot_fits.spot_rows import LEAST_FLUX_E, find_start, subtract_background
 
 # Rows of the settings' table that follow the common ones: flux that is expected; weights of a fit; prior.
 FLUX, WEIGHT_FLOOR, WEIGHT_EXCESS, MODEL_ERROR, PRIOR_WEIGHT = range(COMMON_ROWS, COMMON_ROWS + 5)

@@ -24,7 +24,6 @@ from faintspot.slopes.kernels.compilation.simd import (
     store_all,
     width_of,
 )
-from faintspot.slopes.kernels.spot_fits.profiles import look_up
 from faintspot.slopes.kernels.spot_fits.spot_rows import (
     COVARIANCE,
     ERROR_X,
@@ -60,6 +59,7 @@ from faintspot.slopes.kernels.spot_fits.spot_rows import (
     X,
     Y,
     eliminate_background,
+    look_up,
     model_at,
     noise_of,
     weigh,

@@ -1,1 +1,0 @@
-"""Requests to a running engine (`requests`), its child processes and priority (`child_processes`)."""

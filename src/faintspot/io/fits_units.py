@@ -1,0 +1,315 @@
+"""Header-and-data units of FITS files, read without their data; columns of binary tables; images written."""
+
+from __future__ import annotations
+
+import gzip
+import io
+import math
+import re
+import warnings
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from types import MappingProxyType
+from typing import IO, Any, NamedTuple, cast
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from faintspot.base.errors import InputError, MissingExtraError, load_fits
+from faintspot.base.files import check_bytes, check_regular, write_atomically
+from faintspot.io.stored_array import MOST_WHOLE_BYTES, one_line
+from faintspot.io.zarr_store import check_inflated, is_surely_small
+
+GZIP_SIGNATURE = b"\x1f\x8b"
+_PIECE_BYTES = 1 << 20
+
+
+def is_gzip(path: Path) -> bool:
+    """Return whether a regular file is gzip-compressed, by its first bytes."""
+    check_regular(path)
+    with path.open("rb") as stream:
+        return stream.read(2) == GZIP_SIGNATURE
+
+
+def open_plain_or_gzip(path: Path) -> IO[bytes]:
+    """Open a file for reading; a file with the gzip signature is decompressed."""
+    return cast(IO[bytes], gzip.open(path, "rb")) if is_gzip(path) else path.open("rb")
+
+
+def check_present(name: str, path: Path, stated_bytes: int) -> None:
+    """Raise InputError if a file is shorter than the header of its array states."""
+    n_bytes = path.stat().st_size
+    if n_bytes < stated_bytes:
+        raise InputError(
+            f"{name}: truncated: its header states data up to byte {stated_bytes}, "
+            f"the file has {n_bytes} bytes"
+        )
+
+
+class StreamedArray:
+    """A C-ordered array at a byte offset of a stream, for `StoredArray`.
+
+    A compressed stream is decompressed once if blocks are read in order; going back starts it again. Memory
+    use is one block.
+
+    Parameters
+    ----------
+    stream : binary stream
+    offset : int
+        Start of the array in bytes of the (decompressed) stream.
+    dtype : numpy.dtype
+        Type of the stored numbers, in any byte order.
+    shape : tuple of int
+    compressed : bool
+        Read a stream to its end after the last item, where gzip and zip verify their checksums.
+    """
+
+    def __init__(
+        self,
+        stream: IO[bytes],
+        offset: int,
+        dtype: np.dtype[np.generic],
+        shape: tuple[int, ...],
+        *,
+        compressed: bool = False,
+    ) -> None:
+        self._stream, self._offset, self._dtype, self._shape = stream, offset, dtype, shape
+        self._compressed = compressed
+
+    def __getitem__(self, chosen: slice | tuple[Any, ...]) -> NDArray[Any]:
+        """Return items of the first axis, in native byte order; raise EOFError if the data end too early.
+
+        Zeros may come before the slice, for axes of length one.
+        """
+        *ones, part = chosen if isinstance(chosen, tuple) else (chosen,)
+        shape = self._shape[len(ones) :]
+        values = np.empty((part.stop - part.start, *shape[1:]), self._dtype)
+        self._go_to(self._offset + part.start * math.prod(shape[1:]) * self._dtype.itemsize)
+        if self._stream.readinto(values.reshape(-1).view(np.uint8)) < values.nbytes:  # type: ignore[attr-defined]
+            raise EOFError("the data end too early")
+        while self._compressed and part.stop == shape[0] and self._stream.read(_PIECE_BYTES):
+            pass
+        return values.astype(self._dtype.newbyteorder("="), copy=False)
+
+    def _go_to(self, place: int) -> None:
+        """Go to a byte; a compressed stream is read up to it: zip verifies no checksum after a seek."""
+        if not self._compressed or place < self._stream.tell():
+            self._stream.seek(0 if self._compressed else place)
+        while (left := place - self._stream.tell()) > 0 and self._stream.read(min(left, _PIECE_BYTES)):
+            pass
+
+
+AOT_VERSION = "AOT-VERS"
+"""Keyword in the primary header of a file of the Adaptive Optics Telemetry standard."""
+
+
+@dataclass(frozen=True)
+class HeaderDataUnit:
+    """One header-and-data unit (HDU); `shape` is the image's in NumPy's order, () without an image."""
+
+    index: int
+    name: str
+    header: Any
+    compressed: bool
+    shape: tuple[int, ...]
+    data_start: int
+
+    @property
+    def value_bytes(self) -> int:
+        """Size of the values, decompressed."""
+        if not self.compressed:
+            return int(self.header.data_size)
+        return math.prod(self.shape) * abs(int(self.header["ZBITPIX"])) // 8
+
+    @property
+    def tile(self) -> tuple[int, ...] | None:
+        """Shape of the tiles in which an image is compressed."""
+        if not self.compressed:
+            return None
+        n_axes = len(self.shape)
+        whole_rows = {1: self.shape[-1]} if self.shape else {}
+        return tuple(
+            int(self.header.get(f"ZTILE{axis}", whole_rows.get(axis, 1))) for axis in range(n_axes, 0, -1)
+        )
+
+    def check_tiles(self, name: str, path: Path) -> None:
+        """Refuse compressed tiles that are larger, or inflate to more, than a chunk may be.
+
+        Raises
+        ------
+        InputError
+            If there are such tiles.
+        """
+        if not self.compressed:
+            return
+        itemsize = abs(int(self.header["ZBITPIX"])) // 8
+        check_bytes(name, math.prod(self.tile or ()) * itemsize, MOST_WHOLE_BYTES, "a chunk")
+        with open_plain_or_gzip(path) as stream:
+            opened = load_fits().open(stream, memmap=False, disable_image_compression=True)
+            rows = np.asarray(opened[self.index].data)
+            heap = self.data_start + int(self.header.get("THEAP", rows.nbytes))
+            for column in {"COMPRESSED_DATA", "GZIP_COMPRESSED_DATA"} & set(rows.dtype.names or ()):
+                for size, offset in rows[column].tolist():
+                    if not is_surely_small(size, "deflate"):
+                        stream.seek(heap + offset)
+                        if (content := stream.read(size))[:2] == GZIP_SIGNATURE:
+                            check_inflated(name, content, "deflate")
+
+    @classmethod
+    def of(cls, index: int, header: Any, data_start: int) -> HeaderDataUnit:
+        """Interpret a header; a wrong one raises the exceptions of astropy."""
+        compressed = bool(header.get("ZIMAGE", False))
+        is_image = compressed or index == 0 or str(header["XTENSION"]).strip() == "IMAGE"
+        axes = "ZNAXIS" if compressed else "NAXIS"
+        n_axes = int(header[axes]) if is_image else 0
+        shape = tuple(int(header[f"{axes}{axis}"]) for axis in range(n_axes, 0, -1))
+        if min((header.data_size, *shape)) < 0:
+            raise ValueError("negative size")
+        name = str(header.get("EXTNAME", "PRIMARY" if index == 0 else index))
+        return cls(index, name, header, compressed, shape, data_start)
+
+
+def write_images(
+    path: str | Path, images: Mapping[str, ArrayLike], units: Mapping[str, str] = MappingProxyType({})
+) -> None:
+    """Write arrays to a FITS file, each as an image of its own.
+
+    Parameters
+    ----------
+    path : path
+    images : mapping
+        Arrays by the names of their units.
+    units : mapping
+        Physical units (BUNIT) of some of them.
+
+    Raises
+    ------
+    InputError
+        When the file cannot be written.
+    MissingExtraError
+        When astropy is not installed.
+    """
+    fits, stream = load_fits(), io.BytesIO()
+    primary = fits.PrimaryHDU()
+    primary.header["CREATOR"] = "faintspot"
+    hdus = [primary]
+    for name, values in images.items():
+        hdus.append(fits.ImageHDU(np.atleast_1d(values), name=name))
+        if name in units:
+            hdus[-1].header["BUNIT"] = units[name]
+    fits.HDUList(hdus).writeto(stream, checksum=True)
+    write_atomically(path, stream.getvalue())
+
+
+def units_of(path: Path) -> Iterator[HeaderDataUnit]:
+    """Yield the file's header-and-data units in order, skipping over the data."""
+    header_type = load_fits().Header
+    with open_plain_or_gzip(path) as stream:
+        next_unit, index = 0, 0
+        while True:
+            try:
+                if index == 0 and not stream.read(6) == b"SIMPLE":
+                    raise ValueError("it does not start with SIMPLE")
+                stream.seek(next_unit)
+                with warnings.catch_warnings():
+                    warnings.simplefilter("ignore")
+                    header = header_type.fromfile(stream)
+                    unit = HeaderDataUnit.of(index, header, stream.tell())
+            except Exception as error:  # astropy raises many kinds of errors on damaged headers
+                if index > 0:
+                    return  # the end of the file, or data of no interest behind the last unit
+                raise InputError(f"{path}: expected a FITS file ({one_line(error)})") from None
+            yield unit
+            next_unit = unit.data_start + header.data_size_padded
+            index += 1
+
+
+def is_aot(path: str | Path) -> bool:
+    """Return whether a file is a FITS file of the Adaptive Optics Telemetry standard."""
+    try:
+        return AOT_VERSION in next(units_of(Path(path))).header
+    except (InputError, MissingExtraError, OSError):  # another or a damaged file; its reader gives the reason
+        return False
+
+
+_FORMAT = re.compile(r"(\d*)([LXBIJKAEDCMPQ])")
+_BYTES = {"L": 1, "A": 1, "C": 8, "M": 16, "P": 8, "Q": 16}
+_NUMBERS = {"B": "u1", "I": ">i2", "J": ">i4", "K": ">i8", "E": ">f4", "D": ">f8"}
+
+
+class Column(NamedTuple):
+    """A column of numbers."""
+
+    name: str
+    rows: np.dtype[Any]
+    """A row of the table, with the column as its only field."""
+    length: int
+    """Number of rows."""
+    cards: dict[str, Any]
+    """Scaling, by the keywords of images: BSCALE, BZERO and BLANK."""
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Shape of the values, (rows, ...)."""
+        return self.length, *self.rows[0].shape
+
+    @property
+    def stored_type(self) -> np.dtype[Any]:
+        """Type of the stored numbers."""
+        return self.rows[0].base
+
+
+def is_table(unit: HeaderDataUnit) -> bool:
+    """Return whether a unit is a binary table, and no compressed image."""
+    return unit.index > 0 and not unit.compressed and str(unit.header["XTENSION"]).strip() == "BINTABLE"
+
+
+def columns_of(unit: HeaderDataUnit) -> dict[str, Column]:
+    """Return the columns of numbers by name; texts, bits and arrays of varying length are left out.
+
+    Raises
+    ------
+    ValueError
+        When the header is damaged.
+    """
+    header, columns, offset = unit.header, {}, 0
+    row_bytes, count = int(header["NAXIS1"]), int(header["NAXIS2"])
+    check_bytes(unit.name, row_bytes, MOST_WHOLE_BYTES, "a row")
+    for number in range(1, int(header["TFIELDS"]) + 1):
+        described = _FORMAT.match(str(header[f"TFORM{number}"]).strip())
+        if described is None:
+            raise ValueError(f"TFORM{number} is not known")
+        repeat, code = int(described[1] or 1), described[2]
+        name = str(header.get(f"TTYPE{number}", f"COLUMN{number}")).strip()
+        if code in _NUMBERS and repeat:
+            sides = re.findall(r"\d+", str(header.get(f"TDIM{number}", "")))
+            shape = tuple(map(int, reversed(sides)))
+            if not shape or math.prod(shape) != repeat:
+                shape = (repeat,) if repeat > 1 else ()
+            row: Any = {"names": ["values"], "formats": [(_NUMBERS[code], shape)], "offsets": [offset]}
+            row["itemsize"] = row_bytes
+            keys = {"BSCALE": "TSCAL", "BZERO": "TZERO", "BLANK": "TNULL"}
+            cards = {key: header[f"{own}{number}"] for key, own in keys.items() if f"{own}{number}" in header}
+            # NumPy refuses a field that does not fit into the row.
+            columns[name] = Column(name, np.dtype(row), count, cards)
+        offset += -(-repeat // 8) if code == "X" else repeat * _size(code)
+    if offset != row_bytes:
+        raise ValueError(f"its columns have {offset} bytes, NAXIS1 says {row_bytes}")
+    return columns
+
+
+def _size(code: str) -> int:
+    return np.dtype(_NUMBERS[code]).itemsize if code in _NUMBERS else _BYTES[code]
+
+
+class ColumnValues:
+    """Stored numbers of a column, from rows that are read in pieces of bounded size."""
+
+    def __init__(self, rows: StreamedArray, row_bytes: int) -> None:
+        self._rows, self._step = rows, max(1, _PIECE_BYTES // max(row_bytes, 1))
+
+    def __getitem__(self, part: slice) -> NDArray[Any]:
+        starts = range(part.start, part.stop, self._step)
+        pieces = [self._rows[first : min(first + self._step, part.stop)]["values"] for first in starts]
+        return np.concatenate(pieces)

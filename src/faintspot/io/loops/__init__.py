@@ -1,1 +1,0 @@
-"""Loops that other systems recorded: tables and save files of observatories, milk, pyRTC, folders."""

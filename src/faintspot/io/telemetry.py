@@ -1,0 +1,338 @@
+"""Recorded telemetry, read from its store also while the engine runs; frame numbers left out."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from faintspot.base.errors import InputError, load_zarr
+from faintspot.base.files import check_bytes, memory_bytes
+from faintspot.base.flags import VARIABLES, are_valid
+from faintspot.io.stored_array import one_line
+from faintspot.io.zarr_store import (
+    TELEMETRY,
+    is_store,
+    open_store,
+    read_items,
+    stored_attributes,
+)
+
+zarr = load_zarr()
+FRAMES, IMAGES = "finished_frames", "finished_images"
+"""Attributes of a store: numbers of complete frames and images."""
+PARTS, CONTROL = "parts", "control"
+"""Large attributes, in a group of their own: the others are replaced with every block of frames."""
+_NOT_STORED = "sequence"  # used by the rings only
+
+
+class ArrayStorage(NamedTuple):
+    """Storage of an array of telemetry."""
+
+    dtype: np.dtype[np.generic]
+    dimensions: tuple[str, ...]
+    units: str
+    in_all: bool
+    """Whether all recordings have it; else it is read as zeros, e.g. commands of an engine without any."""
+
+
+def array(dtype: Any, dimensions: str, units: str = "1", *, in_all: bool = True) -> dict[str, ArrayStorage]:
+    """Return the metadata of a field of `Telemetry`; dimensions are words."""
+    return {"stored": ArrayStorage(np.dtype(dtype), tuple(dimensions.split()), units, in_all)}
+
+
+def of_slopes(name: str, dtype: object, *, in_all: bool = True) -> dict[str, ArrayStorage]:
+    """Return those of a quantity of each slope."""
+    return array(dtype, "frame subaperture", VARIABLES[name].units, in_all=in_all)
+
+
+@dataclass(frozen=True, repr=False)
+class Telemetry:
+    """Recorded telemetry of an engine: arrays (n_frames,) or (n_frames, n_subapertures), in order of arrival.
+
+    Lost frames are absent, which shows in `frame`.
+
+    Examples
+    --------
+    >>> from faintspot.io import read_telemetry
+    >>> recording = read_telemetry("night.zarr", images=False)  # doctest: +SKIP
+    >>> recording.x.std(axis=0), recording.latency_s.max()  # doctest: +SKIP
+    """
+
+    frame: NDArray[np.int64] = field(metadata=array(np.int64, "frame"))
+    """Frame numbers of the camera."""
+    method: NDArray[np.int64] = field(metadata=array(np.int64, "frame"))
+    """Number of the interleaved configuration, an index into ``attributes["methods"]``; 0 without."""
+    change: NDArray[np.int64] = field(metadata=array(np.int64, "frame"))
+    """Number of the last change of settings that applies, see `changes`; 0: none."""
+    last_row_time_ns: NDArray[np.int64] = field(metadata=array(np.int64, "frame", "ns"))
+    """Arrival of the last row, CLOCK_MONOTONIC, ns."""
+    published_time_ns: NDArray[np.int64] = field(metadata=array(np.int64, "frame", "ns"))
+    """Publication of the slopes, CLOCK_MONOTONIC, ns."""
+    clock_offset_ns: NDArray[np.int64] = field(metadata=array(np.int64, "frame", "ns"))
+    """Offset from these times to Unix time by the wall clock at that moment, which may be reset meanwhile."""
+    late: NDArray[np.int64] = field(metadata=array(np.int64, "frame", in_all=False))
+    """Cause of a frame that was late (`faintspot.engine.path.timing.CAUSES`); 0: in time."""
+    lost: NDArray[np.int64] = field(metadata=array(np.int64, "frame", in_all=False))
+    """Number of frames that the engine lost since the one before."""
+    lost_because: NDArray[np.int64] = field(metadata=array(np.int64, "frame", in_all=False))
+    """Cause of the last of them, likewise."""
+    x: NDArray[np.float32] = field(metadata=of_slopes("x", np.float32))
+    """Slopes, px, as in `faintspot.Slopes`; likewise the next ones."""
+    y: NDArray[np.float32] = field(metadata=of_slopes("y", np.float32))
+    flux: NDArray[np.float32] = field(metadata=of_slopes("flux", np.float32))
+    """Flux in electrons."""
+    standard_error_x: NDArray[np.float32] = field(metadata=of_slopes("standard_error_x", np.float32))
+    """Standard error of x, px."""
+    standard_error_y: NDArray[np.float32] = field(metadata=of_slopes("standard_error_y", np.float32))
+    covariance_xy: NDArray[np.float32] = field(metadata=of_slopes("covariance_xy", np.float32, in_all=False))
+    """Covariance of the errors of x and y, px^2; 0 in recordings without it."""
+    iterations: NDArray[np.int32] = field(metadata=of_slopes("iterations", np.int32))
+    flags: NDArray[np.uint8] = field(metadata=of_slopes("flags", np.uint8))
+    """Bits of `faintspot.SubapertureFlag`."""
+    loop: NDArray[np.int64] = field(metadata=array(np.int64, "frame", in_all=False))
+    """State of the loop: 0 no loop, 1 open, 2 closed."""
+    commands: NDArray[np.float32] = field(metadata=array(np.float32, "frame command", in_all=False))
+    """Commands that follow from each frame, in the interaction matrix's unit, (n_frames, commands)."""
+    image_frame: NDArray[np.int64] = field(metadata=array(np.int64, "image"))
+    """Numbers of the frames with recorded images, (n_images,)."""
+    raw: NDArray[np.float32] = field(metadata=array(np.float32, "image row column", "adu"))
+    """Those frames, ADU, (n_images, height, width)."""
+    denoised: NDArray[np.float32] = field(
+        metadata=array(np.float32, "image subaperture window_row window_column", "e-")
+    )
+    """Their denoised sub-aperture images, electrons, (n_images, n_subapertures, ny, nx)."""
+    changes: list[dict[str, Any]]
+    """Changes of settings: frame (the first with it), number, changes (values by name), where (None: all)."""
+    attributes: dict[str, Any]
+    """Plain values: layout (``Layout(**attributes["layout"])``), initial settings (TOML), methods (names of
+    the interleaved configurations); reference (slopes that were subtracted) and control (interaction matrix
+    and options, see `faintspot.loop.control.options`), each or None; dropped_records, dropped_images,
+    dropped_changes, complete, ended_because."""
+
+    def __repr__(self) -> str:
+        """Return the numbers of frames, sub-apertures, images and changes."""
+        return (
+            f"Telemetry({len(self.frame)} frames, {self.x.shape[-1]} sub-apertures, "
+            f"{len(self.image_frame)} images, {len(self.changes)} changes of settings)"
+        )
+
+    @property
+    def slopes(self) -> NDArray[np.float32]:
+        """Slopes for a reconstructor, px, (n_frames, 2 n_subapertures): all x, then all y."""
+        return np.concatenate([self.x, self.y], axis=-1)
+
+    @property
+    def valid(self) -> NDArray[np.bool_]:
+        """Whether each slope was measured, and is not flagged as probably wrong."""
+        return are_valid(self.flags)
+
+    @property
+    def latency_s(self) -> NDArray[np.float64]:
+        """Latency from the last row to the slopes, (n_frames,)."""
+        return (self.published_time_ns - self.last_row_time_ns) / 1e9
+
+    @property
+    def unix_time_s(self) -> NDArray[np.float64]:
+        """Unix time of the arrival of the last row, (n_frames,).
+
+        Taken from the wall clock at the first frame: it never decreases, even if the wall clock was reset.
+        """
+        offset = self.clock_offset_ns[0] if len(self.clock_offset_ns) else 0
+        return (self.last_row_time_ns + offset) / 1e9
+
+
+ARRAYS: dict[str, ArrayStorage] = {
+    item.name: item.metadata["stored"] for item in fields(Telemetry) if item.metadata
+}
+
+
+def item_type(
+    item: str, sizes: Mapping[str, int], without: Collection[str] = (), *, align: bool = False
+) -> np.dtype[np.void]:
+    """Return the type of a record ("frame") or of an "image": `sequence`, and the arrays of `Telemetry`.
+
+    Parameters
+    ----------
+    item : str
+    sizes : mapping
+        Sizes of the other dimensions.
+    without : collection of str
+        Arrays to leave out.
+    align : bool
+        Whether each array begins at a multiple of its numbers' size.
+    """
+    columns: list[object] = [(_NOT_STORED, np.int64)]
+    for name, stored in ARRAYS.items():
+        first, *others = stored.dimensions
+        if first == item and name not in without:
+            columns.append((name, stored.dtype, tuple(sizes[other] for other in others)))
+    return np.dtype(columns, align=align)
+
+
+def read_telemetry(path: str | Path, *, images: bool = True) -> Telemetry:
+    """Read a recording of `faintspot realtime record`, even while it is being written.
+
+    Parameters
+    ----------
+    path : path
+        The Zarr store.
+    images : bool
+        Whether to read the images, which need the most memory; otherwise there are none.
+
+    Returns
+    -------
+    Telemetry
+
+    Raises
+    ------
+    InputError
+        When it is not a telemetry store, or damaged.
+
+    Examples
+    --------
+    >>> from faintspot.io import read_telemetry
+    >>> recording = read_telemetry("night.zarr", images=False)  # doctest: +SKIP
+    >>> recording.x.std(axis=0), recording.latency_s.max()  # doctest: +SKIP
+    """
+    stored = StoredTelemetry(path)
+    check_bytes(stored.path, stored.size(images=images), memory_bytes() // 2, "telemetry")
+    counts = {"frame": stored.frames, "image": stored.images if images else 0}
+    arrays = {name: stored.read(name, 0, counts[kind.dimensions[0]]) for name, kind in ARRAYS.items()}
+    return Telemetry(**arrays, changes=stored.changes, attributes=stored.attributes)
+
+
+class StoredTelemetry:
+    """A telemetry store at the time of opening, even while it is being written, read in parts.
+
+    Parameters
+    ----------
+    path : path
+        The Zarr store.
+
+    Attributes
+    ----------
+    path : Path
+    attributes : dict
+        See `Telemetry.attributes`.
+    changes : list of dict
+        See `Telemetry.changes`.
+    frames, images : int
+        Numbers of complete frames and images in the store.
+
+    Raises
+    ------
+    InputError
+        When it is not a telemetry store, or damaged.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        self.path = Path(path)
+        self.attributes = self._attributes()
+        with self._damage():
+            self._group: Any = open_store(self.path)
+            self.frames, self.images = (int(self.attributes[name]) for name in (FRAMES, IMAGES))
+            self.changes: list[dict[str, Any]] = self.attributes.pop("changes")
+            self.frames_together = int(self._group["x"].chunks[0])
+            """Number of frames in a chunk of slopes, which is read as a whole."""
+
+    def _attributes(self) -> dict[str, Any]:
+        """Return the attributes; refuse what is not a telemetry store."""
+        store = self.path
+        if not store.exists():
+            raise InputError(f"{store}: no such file or directory")
+        try:
+            attributes = stored_attributes(store)
+            is_telemetry = attributes["format"] == TELEMETRY and attributes["version"] == 1
+            if (store / PARTS).is_dir():
+                stored = stored_attributes(store / PARTS)
+                attributes |= {PARTS: stored[PARTS], CONTROL: stored.get(CONTROL)}
+        except (OSError, ValueError, KeyError, TypeError):
+            is_telemetry = False
+        if not (is_telemetry and is_store(store)):
+            raise InputError(f"{store}: expected a Zarr store of telemetry from `faintspot realtime record`")
+        return attributes
+
+    def __contains__(self, name: str) -> bool:
+        """Return whether the store has an array."""
+        return name in self._group
+
+    def size(self, *, images: bool) -> int:
+        """Return the bytes of all arrays in memory."""
+        with self._damage(), warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of files that a recorder has not finished
+            arrays = list(self._group.arrays())
+        left_out = () if images else ("raw", "denoised")
+        return sum(array.nbytes for name, array in arrays if name not in left_out)
+
+    def check_shapes(self, kinds: Sequence[np.dtype[np.void]]) -> None:
+        """Refuse a store whose arrays do not have these types of records and images.
+
+        Raises
+        ------
+        InputError
+            When an array is missing, or its items have another shape.
+        """
+        for kind in kinds:
+            for name in stored_names(kind):
+                wanted = kind[name].shape
+                if self.read(name, 0, 0).shape[1:] != wanted:
+                    raise InputError(
+                        f"{self.path}: the store is damaged ({name}: expected items of {wanted})"
+                    )
+
+    def read(self, name: str, start: int, stop: int) -> NDArray[Any]:
+        """Return items `start` to `stop` of an array, by its name in `Telemetry`.
+
+        Raises
+        ------
+        InputError
+            When the store is damaged there.
+        """
+        count = stop - start
+        with self._damage():
+            if name not in self and not ARRAYS[name].in_all:
+                sizes = {"frame": count, "command": 0, "subaperture": self._group["x"].shape[1]}
+                shape = [sizes[dimension] for dimension in ARRAYS[name].dimensions]
+                return np.zeros(shape, ARRAYS[name].dtype)
+            array = self._group[name]
+        if stop > array.shape[0]:
+            raise InputError(f"{self.path}: the store is damaged ({name}: {array.shape[0]} of {stop})")
+        return np.asarray(read_items(self.path, array, start, stop))
+
+    @contextmanager
+    def _damage(self) -> Iterator[None]:
+        try:
+            yield
+        except Exception as error:  # zarr raises many kinds of errors on broken stores
+            raise InputError(f"{self.path}: the store is damaged ({one_line(error)})") from None
+
+
+def stored_names(kind: np.dtype[np.void]) -> list[str]:
+    """Return the fields of records or images that have an array in a store."""
+    return [name for name in kind.names or () if name != _NOT_STORED]
+
+
+LARGEST_GAP = 1_000_000
+"""Largest number of frames lost in a row, 17 minutes at 1 kHz; a larger gap counts as a restart."""
+
+
+def left_out(before: int, after: int) -> int:
+    """Return how many numbers are missing between two, or -1 if the source restarted.
+
+    It restarted if the later number is not larger, or is larger by more than `LARGEST_GAP`.
+    """
+    between = after - before - 1
+    return between if 0 <= between <= LARGEST_GAP else -1
+
+
+def all_left_out(numbers: ArrayLike) -> NDArray[np.int64]:
+    """Return `left_out` for every pair of successive numbers, (n - 1,)."""
+    between = np.diff(np.asarray(numbers, np.int64)) - 1
+    return np.where((between >= 0) & (between <= LARGEST_GAP), between, -1)

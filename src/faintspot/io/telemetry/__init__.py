@@ -1,1 +1,0 @@
-"""Recorded telemetry: our own recordings, and AOT files."""

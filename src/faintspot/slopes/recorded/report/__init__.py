@@ -1,1 +1,0 @@
-"""Report of recorded slopes: `page` shows a `run`, with `pictures`; `stored` makes one of files."""

@@ -1,0 +1,64 @@
+"""IDL's .sav files: variables and fields of structures, plain and compressed; damaged ones."""
+
+import struct
+import zlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tests.io import idl_file
+from tests.refusals import refused
+
+from faintspot.io import read_array, stored_array
+from faintspot.io.formats import hdf5_files
+
+GAIN = np.arange(12, dtype=np.float32).reshape(3, 4)
+FIELDS: dict[str, np.ndarray] = {
+    "DMCOMMAND": np.arange(24.0).reshape(4, 6).astype(np.float32),
+    "TIMESTAMP": np.arange(4, dtype=np.int64) * 20_000,
+    "COUNTS": np.arange(6, dtype=np.int16).reshape(3, 2),
+    "BITS": np.arange(5, dtype=np.uint8),
+}
+
+
+@pytest.mark.parametrize("compressed", [False, True])
+def test_variables_and_fields(tmp_path: Path, compressed: bool) -> None:
+    path = idl_file.write(tmp_path / "trs.sav", {"rx": GAIN, "nrec": np.int16(1), "A": FIELDS}, compressed)
+    np.testing.assert_array_equal(read_array(f"{path}:RX"), GAIN)
+    for name, values in FIELDS.items():
+        stored = read_array(f"{path}:a.{name.lower()}")
+        np.testing.assert_array_equal(stored, values)
+        assert stored.dtype == values.dtype
+    assert {"RX", "NREC", "A.DMCOMMAND"} <= set(hdf5_files.Idl().names(path))
+    with refused("A.DMCOMMAND", "choose one with trs.sav:NAME"):
+        read_array(path)
+    with refused("no array 'A.NONE'"):
+        read_array(f"{path}:A.NONE")
+
+
+@pytest.mark.parametrize("kept", [2, 4, 30, 200, -17, -5])
+def test_truncated(tmp_path: Path, kept: int) -> None:
+    path = idl_file.write(tmp_path / "trs.sav", {"rx": GAIN, "A": FIELDS})
+    path.write_bytes(path.read_bytes()[:kept])
+    with refused("trs.sav"):
+        read_array(f"{path}:RX")
+
+
+def test_records_in_a_circle(tmp_path: Path) -> None:
+    """SciPy would follow them without an end."""
+    path = tmp_path / "trs.sav"
+    path.write_bytes(b"SR\0\4" + struct.pack(">iIII", 19, 4, 0, 0))
+    with refused("its record at byte 4 does not end"):
+        read_array(f"{path}:RX")
+
+
+def test_bomb(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Records that inflate to more than the limit, here 1 MiB, are not inflated."""
+    monkeypatch.setattr(hdf5_files, "MOST_WHOLE_BYTES", 1 << 20)
+    assert stored_array.MOST_WHOLE_BYTES == 1 << 30
+    body = zlib.compress(bytes(3 << 20))
+    content = b"SR\0\6" + struct.pack(">iIII", 2, 20 + len(body), 0, 0) + body
+    path = tmp_path / "trs.sav"
+    path.write_bytes(content + struct.pack(">iIII", 6, 0, 0, 0))
+    with refused("inflates to more than 1 MiB"):
+        read_array(f"{path}:RX")

@@ -1,0 +1,92 @@
+from functools import partial
+
+import numpy as np
+import pytest
+from tests.loop.control.control_cases import FRAME_S, PHASE, PLANT, TURBULENCE, telemetry
+
+from faintspot.loop.control.base import CommandDelayLine, OpenLoopTelemetry, usual_noise, without_prior
+from faintspot.loop.control.identification.learning import learn_controller
+
+
+def test_a_prior_is_taken_out_again() -> None:
+    """A Gaussian posterior gives back the frame's own slope and variance."""
+    rng = np.random.default_rng(1)
+    mean, slope = rng.standard_normal((2, 50))
+    prior, noise = rng.uniform(0.2, 1.0, (2, 50))
+    variance = 1 / (1 / prior**2 + 1 / noise**2)
+    posterior = variance * (mean / prior**2 + slope / noise**2)
+    alone, found, trust = without_prior(posterior, np.sqrt(variance), mean, prior)
+    informed = noise**2 < 50 * prior**2  # less is taken for that
+    np.testing.assert_allclose(alone[informed], slope[informed], rtol=1e-6)
+    np.testing.assert_allclose(found[informed], noise[informed] ** 2, rtol=1e-6)
+    np.testing.assert_allclose((mean + trust * (alone - mean))[informed], posterior[informed], rtol=1e-6)
+
+
+def test_posteriors_wider_than_the_prior_stay_harmless() -> None:
+    _, variance, trust = without_prior(np.ones(3), np.array([2.0, 1.0, np.inf]), np.zeros(3), np.ones(3))
+    np.testing.assert_allclose(variance, [50.0, 50.0, np.inf])
+    np.testing.assert_allclose(trust, [1 / 51, 1 / 51, 0.0])
+
+
+def test_usual_noise_gives_the_mean_information() -> None:
+    """Of one sub-aperture, against whole matrices; without y in one frame, and nothing in another."""
+    rng = np.random.default_rng(1)
+    roots = rng.standard_normal((20, 2, 2))
+    noise = roots @ roots.swapaxes(1, 2) + np.eye(2)
+    information = np.linalg.inv(noise)
+    variance, covariance = np.diagonal(noise, axis1=1, axis2=2).copy(), noise[:, 0, 1].copy()
+    variance[3, 1], variance[7], covariance[[3, 7]] = np.inf, np.inf, 0.0
+    information[3], information[7] = np.diag([1 / variance[3, 0], 0.0]), 0.0
+    zeros = np.zeros_like(variance)
+    found, shared = usual_noise(OpenLoopTelemetry(zeros, variance, zeros, covariance[:, None]))
+    usual = np.linalg.inv(information.mean(axis=0))
+    np.testing.assert_allclose(found, np.diag(usual))
+    np.testing.assert_allclose(shared, usual[0, 1])
+
+
+@pytest.mark.slow
+def test_what_has_learnt_leaves_less() -> None:
+    """On other frames of the same air, than the integrator with the gain that is best there."""
+    learnt = learn_controller(PLANT, telemetry(1200, 0.5), TURBULENCE, 1 / FRAME_S)
+    other = telemetry(1500, 0.5, seed=6).scaled(learnt.noise_factor)
+    plain = min(
+        PLANT.residual(partial(PLANT.integrator, gain), other, PHASE) for gain in (0.1, 0.2, 0.3, 0.4, 0.5)
+    )
+    assert PLANT.residual(partial(learnt.guarded, PLANT), other, PHASE) < 0.99 * plain
+
+
+@pytest.mark.parametrize("delay", [1, 2, 5])
+def test_a_command_acts_after_the_delay(delay: int) -> None:
+    line, acted = CommandDelayLine(1, delay), []
+    for frame in range(1, 12):
+        acted.append(float(line.acting[0]))
+        line.put(np.array([float(frame)]))
+        assert line.latest[0] == frame
+    assert acted == [0.0] * delay + list(range(1, 12 - delay))
+
+
+def test_no_command_is_beyond_the_stroke() -> None:
+    line = CommandDelayLine(3, 2, 10.0)
+    line.put(np.array([5.0, 20.0, -1e30]))
+    np.testing.assert_array_equal(line.latest, [5.0, 10.0, -10.0])
+    line.hold(np.array([0.0, 99.0, -99.0]))
+    np.testing.assert_array_equal(line.acting, [0.0, 10.0, -10.0])
+    np.testing.assert_array_equal(line.latest, line.acting)
+
+
+@pytest.mark.parametrize("wrong", [np.nan, np.inf, -np.inf])
+def test_a_command_that_is_not_finite_is_not_sent(wrong: float) -> None:
+    """Not even at the stroke: it does not say in which direction the mirror should go."""
+    line = CommandDelayLine(2, 1, 10.0)
+    line.put(np.array([1.0, 2.0]))
+    with pytest.raises(ArithmeticError):
+        line.put(np.array([wrong, 3.0]))
+    np.testing.assert_array_equal(line.latest, [1.0, 2.0])
+    np.testing.assert_array_equal(line.acting, [1.0, 2.0])
+
+
+def test_what_the_caller_does_with_its_array_later_does_not_matter() -> None:
+    line, command = CommandDelayLine(2, 2), np.ones(2)
+    line.put(command)
+    command[:] = 7.0
+    np.testing.assert_array_equal(line.latest, 1.0)
