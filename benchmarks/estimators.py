@@ -16,8 +16,8 @@ import numpy as np
 import faintspot as fs
 from benchmarks.measuring import Candidate, Row, Table, Times, best, interleaved, pinned, ratio
 from faintspot.slopes.estimators import estimator_named
-from faintspot.slopes.kernels.compilation.host import lanes_for
-from faintspot.slopes.kernels.driver.groups import Source, flux_of_groups, new_scratch
+from faintspot.slopes.kernels.groups import Source, flux_of_groups, new_scratch
+from faintspot.slopes.kernels.host import lanes_for
 from faintspot.slopes.pipeline.plan import packed_calibration
 
 ITERATIONS, KEEP, NOISE_STD, FLUX_E, READ_NOISE_E = 20, 12, 0.45, 200.0, 0.1

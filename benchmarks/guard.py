@@ -28,7 +28,7 @@ from faintspot.loop.control.identification.open_loop import open_loop_of
 from faintspot.loop.control.identification.predictive_control import PredictiveControl, learn
 from faintspot.loop.control.identification.recording import Recording, prepared
 from faintspot.loop.control.reconstructor import make_reconstructor
-from faintspot.loop.turbulence.slope_covariance import ARCSEC
+from faintspot.loop.slope_covariance import ARCSEC
 from faintspot.slopes.spots.von_karman import R0_WAVELENGTH_M, SPECTRUM
 
 Floats = NDArray[np.float64]

@@ -25,7 +25,7 @@ PACKAGES = (
 
 def fingerprint() -> dict[str, str]:
     """Return everything that must be the same for two runs to be comparable."""
-    from faintspot.slopes.kernels.compilation.host import lanes_for
+    from faintspot.slopes.kernels.host import lanes_for
     from faintspot.slopes.kernels.parallel import available_cpus
 
     return {

@@ -38,7 +38,7 @@ from faintspot.loop.simulation.atmosphere import MovingLayers
 from faintspot.loop.simulation.record import slope_turbulence
 from faintspot.loop.simulation.simulation import measure_gains
 from faintspot.loop.simulation.telescope import TelescopeModel, make_pipeline, prepare
-from faintspot.loop.turbulence.slope_covariance import SlopeTurbulence
+from faintspot.loop.slope_covariance import SlopeTurbulence
 from faintspot.slopes.pipeline.settings import Settings
 
 Floats = NDArray[np.float64]

@@ -17,7 +17,7 @@ from faintspot.loop.control.integrator import Integrator
 from faintspot.loop.simulation import LoopConfiguration, Method, load_loop
 from faintspot.loop.simulation.simulation import measure_gains
 from faintspot.loop.simulation.telescope import TelescopeModel, make_pipeline
-from faintspot.loop.turbulence.slope_covariance import ARCSEC
+from faintspot.loop.slope_covariance import ARCSEC
 from faintspot.slopes.pipeline.settings import Settings
 
 Floats = NDArray[np.float64]

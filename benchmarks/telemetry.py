@@ -19,9 +19,9 @@ from benchmarks.recorded_loops import Truth, drawn_cases, recorded, winds_of
 from faintspot.loop.control.identification.open_loop import Measured
 from faintspot.loop.control.identification.recording import Recording
 from faintspot.loop.simulation import LoopRecord, Method, load_loop, simulate_loop
+from faintspot.loop.slope_covariance import ARCSEC
 from faintspot.loop.telemetry.choices import AS_RUN, FILTER
 from faintspot.loop.telemetry.report import LoopReport, report_of_loop
-from faintspot.loop.turbulence.slope_covariance import ARCSEC
 from faintspot.slopes.pipeline.settings import Settings
 
 Pairs = dict[str, list[tuple[Measured, float]]]

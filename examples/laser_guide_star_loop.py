@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 import faintspot as fs
-from faintspot.cli.shared.progress import progress_bar
+from faintspot.cli.output import progress_bar
 from faintspot.experiments.closed_loop.search import FIRST_TUNING_REALISATION
 from faintspot.loop.simulation import LoopConfiguration, LoopRecord, Method, load_loop, simulate_loop
 

@@ -20,12 +20,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 import faintspot as fs
-from faintspot.cli.shared.progress import progress_bar
+from faintspot.cli.output import progress_bar
 from faintspot.loop.control.flattening import phase_of_commands
 from faintspot.loop.control.kalman.local_predictor import LocalPredictor, local_filter
 from faintspot.loop.control.kalman.predictor import SlopeModel, SlopePredictor
 from faintspot.loop.control.reconstructor import add_noise, weighted_slopes
-from faintspot.loop.turbulence.slope_covariance import SlopeTurbulence, phase_covariance_rad2
+from faintspot.loop.slope_covariance import SlopeTurbulence, phase_covariance_rad2
 
 Floats = NDArray[np.float64]
 

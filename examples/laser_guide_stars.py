@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import faintspot as fs
-from faintspot.cli.shared.progress import progress_bar
+from faintspot.cli.output import progress_bar
 from faintspot.slopes.training import MeanImages, fit_spot
 from faintspot.slopes.wavefront.zernike import mean_gradients
 

@@ -9,8 +9,8 @@ errors are smaller than those of R. docs/automatic.md has the table.
 import numpy as np
 
 import faintspot as fs
-from faintspot.slopes.estimators.algorithms.automatic import automatic_strength
-from faintspot.slopes.estimators.algorithms.noise import suggested_strength
+from faintspot.slopes.estimators.automatic import automatic_strength
+from faintspot.slopes.estimators.noise import suggested_strength
 
 SPOTS, SEED = 4000, 2
 FLUXES_E, READ_NOISES_E, SIDES = (20.0, 50.0, 100.0, 200.0), (1.0, 3.0), (8, 16)

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 import faintspot as fs
 from faintspot.base.statistics import absolute_errors
 from faintspot.io import open_frames
-from faintspot.slopes.estimators.algorithms.noise import suggested_strength
+from faintspot.slopes.estimators.noise import suggested_strength
 
 KEPT = (6, 8, 10, 12, 16, 20, 25, 30, 40, 50, 60, 80)
 FIXED = 40

@@ -25,7 +25,7 @@ import faintspot as fs
 from faintspot.base.statistics import slope_statistics
 from faintspot.experiments.study.cell_methods import position_table
 from faintspot.experiments.study.sweep import Cell
-from faintspot.slopes.estimators.algorithms.automatic import automatic_kept_pixels, automatic_strength
+from faintspot.slopes.estimators.automatic import automatic_kept_pixels, automatic_strength
 from faintspot.slopes.estimators.built_in.gravity import BrightestPixels
 from faintspot.slopes.simulate import Detector, subapertures
 

@@ -31,7 +31,7 @@ from faintspot.loop.simulation import LoopConfiguration, Method, load_loop, simu
 from faintspot.loop.simulation.learning import learnt_control
 from faintspot.loop.simulation.simulation import _Loop
 from faintspot.loop.simulation.telescope import LoopOptics, TelescopeModel, prepare
-from faintspot.loop.turbulence.slope_covariance import phase_covariance_rad2
+from faintspot.loop.slope_covariance import phase_covariance_rad2
 
 Floats = NDArray[np.float64]
 

@@ -38,7 +38,7 @@ POSIX_FUNCTIONS = ("pread", "pwrite", "mkfifo", "getuid", "sched_getaffinity", "
 NEED_POSIX = (
     "faintspot.engine",
     "faintspot.cli.realtime",
-    "faintspot.cli.shared.engine_requests",
+    "faintspot.cli.realtime.engine_requests",
     "faintspot.adapters.pyrtc",
 )
 

@@ -17,7 +17,7 @@ from tests.patience import examples
 
 import faintspot as fs
 from faintspot.slopes.estimators import estimators
-from faintspot.slopes.kernels.driver.groups import new_scratch
+from faintspot.slopes.kernels.groups import new_scratch
 from faintspot.slopes.pipeline.following import measure_images
 from faintspot.slopes.spots.bounds import cramer_rao
 from faintspot.slopes.spots.psf import PSF

@@ -25,7 +25,7 @@ from tests.refusals import assert_each_refused, refused
 
 import faintspot as fs
 from faintspot.slopes.estimators import estimators
-from faintspot.slopes.kernels.driver import groups
+from faintspot.slopes.kernels import groups
 from faintspot.slopes.pipeline.following import measure_images
 from faintspot.slopes.spots.psf import PSF
 

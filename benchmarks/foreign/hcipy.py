@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 import faintspot as fs
 from benchmarks.foreign.base import IMAGING_M, Floats, SteppedLoop
 from benchmarks.foreign.specula import example
-from faintspot.loop.turbulence.slope_covariance import ARCSEC
+from faintspot.loop.slope_covariance import ARCSEC
 
 _SHARES = 0.5, 0.3, 0.2
 _TILT_RAD = 1e-7

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 import faintspot as fs
 from benchmarks.foreign.base import IMAGING_M, Control, Floats, SteppedLoop
 from faintspot.loop.control.identification.vibrations import Vibration
-from faintspot.loop.turbulence.slope_covariance import ARCSEC
+from faintspot.loop.slope_covariance import ARCSEC
 
 _R0_M = 0.25  # of the turbulence that is simulated; another r0 scales it
 POKE_M = 2e-8

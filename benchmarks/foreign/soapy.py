@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 import faintspot as fs
 from benchmarks.foreign.base import IMAGING_M, Floats, SteppedLoop
 from faintspot.adapters.oopao import Spots
-from faintspot.loop.turbulence.slope_covariance import ARCSEC
+from faintspot.loop.slope_covariance import ARCSEC
 
 _READ_NOISE_E = 1.0
 _LENSLET_M, _SUBAPERTURE_PX, _FIELD_ARCSEC = 0.6, 12, 1.8

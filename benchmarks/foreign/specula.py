@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.foreign.base import SETTLE_FRAMES, Control, Floats, ForeignLoop, Observed
-from faintspot.loop.turbulence.slope_covariance import ARCSEC
+from faintspot.loop.slope_covariance import ARCSEC
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 _QUANTUM_EFFICIENCY = 0.01 / 40.0

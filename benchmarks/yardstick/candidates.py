@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 import faintspot as fs
 from benchmarks.yardstick.network import Network
 from benchmarks.yardstick.spots import Floats
-from faintspot.slopes.estimators.algorithms.noise import suggested_strength
+from faintspot.slopes.estimators.noise import suggested_strength
 from faintspot.slopes.training.psf_learning import LearntPSF
 
 Images = NDArray[Any]

@@ -23,10 +23,10 @@ if TYPE_CHECKING:
     from faintspot.loop import control as control
     from faintspot.slopes.camera.calibration import Calibration as Calibration
     from faintspot.slopes.camera.photon_transfer import measure_detector as measure_detector
-    from faintspot.slopes.estimators.algorithms.centroid import brightest_pixels as brightest_pixels
-    from faintspot.slopes.estimators.algorithms.centroid import centre_of_gravity as centre_of_gravity
-    from faintspot.slopes.estimators.algorithms.noise import Denoised as Denoised
-    from faintspot.slopes.estimators.algorithms.noise import tv_denoise as tv_denoise
+    from faintspot.slopes.estimators.centroid import brightest_pixels as brightest_pixels
+    from faintspot.slopes.estimators.centroid import centre_of_gravity as centre_of_gravity
+    from faintspot.slopes.estimators.noise import Denoised as Denoised
+    from faintspot.slopes.estimators.noise import tv_denoise as tv_denoise
     from faintspot.slopes.pipeline.following import SpotFollower as SpotFollower
     from faintspot.slopes.pipeline.following import measure_images as measure_images
     from faintspot.slopes.pipeline.light import MeanFlux as MeanFlux
@@ -50,7 +50,7 @@ _PACKAGES = ("adapters", "data", "engine", "experiments", "io", "loop", "slopes"
 # Where each public name lives. They are imported at first use: `import faintspot` itself stays fast.
 _HOMES = {
     "Calibration": "faintspot.slopes.camera.calibration",
-    "Denoised": "faintspot.slopes.estimators.algorithms.noise",
+    "Denoised": "faintspot.slopes.estimators.noise",
     "FixedWeights": "faintspot.slopes.spots.fixed_weights",
     "InputError": "faintspot.base.errors",
     "LaserGuideStar": "faintspot.slopes.spots.laser",
@@ -66,8 +66,8 @@ _HOMES = {
     "Stages": "faintspot.slopes.pipeline.slopes",
     "SubapertureFlag": "faintspot.base.flags",
     "Wavefront": "faintspot.slopes.wavefront",
-    "brightest_pixels": "faintspot.slopes.estimators.algorithms.centroid",
-    "centre_of_gravity": "faintspot.slopes.estimators.algorithms.centroid",
+    "brightest_pixels": "faintspot.slopes.estimators.centroid",
+    "centre_of_gravity": "faintspot.slopes.estimators.centroid",
     "control": "faintspot.loop",
     "cramer_rao": "faintspot.slopes.spots.bounds",
     "cramer_rao_covariance": "faintspot.slopes.spots.bounds",
@@ -77,7 +77,7 @@ _HOMES = {
     "measure_detector": "faintspot.slopes.camera.photon_transfer",
     "photon_efficiency": "faintspot.slopes.spots.bounds",
     "tune": "faintspot.experiments",
-    "tv_denoise": "faintspot.slopes.estimators.algorithms.noise",
+    "tv_denoise": "faintspot.slopes.estimators.noise",
     **{name: f"faintspot.{name}" for name in _PACKAGES},
 }
 

@@ -3,7 +3,7 @@ from typing import Any
 import numpy as np
 import pytest
 from tests.refusals import refused
-from tests.slopes.estimators.algorithms.image_cases import BAD_IMAGES
+from tests.slopes.estimators.image_cases import BAD_IMAGES
 
 from faintspot.base import checks
 

@@ -7,8 +7,8 @@ import threading
 import numpy as np
 import pytest
 
-from faintspot.cli.shared.engine_requests import stop_on_signal
-from faintspot.slopes.kernels.driver import streaming
+from faintspot.cli.realtime.engine_requests import stop_on_signal
+from faintspot.slopes.kernels import streaming
 
 pytestmark = pytest.mark.slow
 

@@ -22,7 +22,7 @@ from faintspot.loop.control.identification.learning import learn_controller
 from faintspot.loop.control.identification.model import Kalman
 from faintspot.loop.control.integrator import Integrator
 from faintspot.loop.control.options import ControlOptions
-from faintspot.slopes.kernels.driver.products import add_slopes
+from faintspot.slopes.kernels.products import add_slopes
 from faintspot.slopes.pipeline.slopes import RESULT_TYPES, Slopes
 from faintspot.slopes.sensor.layout import Layout
 

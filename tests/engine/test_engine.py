@@ -18,7 +18,7 @@ import faintspot as fs
 from faintspot.cli.realtime import control as realtime_control
 from faintspot.engine.engine import Engine
 from faintspot.engine.path.workers import PipelineMaker
-from faintspot.engine.pixels.replay import Replay
+from faintspot.engine.pixels.readout import Replay
 from faintspot.engine.request_handlers import commands_of
 from faintspot.engine.streams.bridge import StreamBridge
 from faintspot.io import open_frames

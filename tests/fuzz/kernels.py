@@ -32,10 +32,10 @@ from faintspot.base.tables import PRESETS
 from faintspot.engine.path import frame_path
 from faintspot.engine.path.frame_path import FramePath, Progress
 from faintspot.slopes.estimators import estimators
-from faintspot.slopes.estimators.algorithms.centroid import brightest_pixels
+from faintspot.slopes.estimators.centroid import brightest_pixels
 from faintspot.slopes.kernels import parallel
-from faintspot.slopes.kernels.compilation.host import WIDTHS
-from faintspot.slopes.kernels.driver.groups import STAGE_ROWS, SlopeArrays, new_scratch
+from faintspot.slopes.kernels.groups import STAGE_ROWS, SlopeArrays, new_scratch
+from faintspot.slopes.kernels.host import WIDTHS
 from faintspot.slopes.pipeline.slope_pipeline import _prior_slopes, kernel_frames
 from faintspot.slopes.pipeline.slopes import RESULT_TYPES, Slopes
 from faintspot.slopes.spots.psf import PSF

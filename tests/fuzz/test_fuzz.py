@@ -9,7 +9,7 @@ from tests.fuzz import kernels
 from tests.fuzz.__main__ import PARTS
 from tests.shared_data import ROOT
 
-from faintspot.slopes.kernels.compilation.host import lanes_for
+from faintspot.slopes.kernels.host import lanes_for
 
 pytestmark = [
     pytest.mark.skipif(sys.platform != "linux", reason="pages are protected as Linux does it"),

@@ -28,7 +28,8 @@ from tests.refusals import refused
 from faintspot.base import files
 from faintspot.base.errors import InputError
 from faintspot.base.flags import VARIABLES, Variable
-from faintspot.io import read_slopes, slopes_writer, slopes_zarr, zarr_store
+from faintspot.io import read_slopes, slopes_writer, zarr_store
+from faintspot.io.formats import zarr_files
 from faintspot.io.slopes import read_reference
 
 CHANGED = {**result(), "x": result()["y"]}
@@ -52,7 +53,7 @@ class SlopeFile:
     @pytest.fixture(autouse=True)
     def small_chunks(self, monkeypatch: pytest.MonkeyPatch) -> None:
         """Ten frames of seven sub-apertures a chunk."""
-        monkeypatch.setattr(slopes_zarr, "_CHUNK_NUMBERS", 70)
+        monkeypatch.setattr(zarr_files, "_CHUNK_NUMBERS", 70)
 
     @pytest.fixture
     def all_marks(self, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -105,7 +106,7 @@ class SlopeFormatTests(SlopeFile):
     def test_memory_does_not_grow_with_the_run(self, path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         if path.suffix in self.texts:
             return
-        monkeypatch.setattr(slopes_zarr, "_CHUNK_NUMBERS", 1 << 16)
+        monkeypatch.setattr(zarr_files, "_CHUNK_NUMBERS", 1 << 16)
         block = result(100, 200)
         with writer_for(path.with_name(f"first_{path.name}"), 100, 200) as writer:  # imports and codecs
             writer.append(0, block)
@@ -315,7 +316,7 @@ class SlopeStoreTests(SlopeFile):
             missing.append({chunk: data for chunk, data in now.items() if synchronised.get(chunk) != data})
             replace(file, content)
 
-        monkeypatch.setattr(slopes_zarr, "sync_file", sync_file)
+        monkeypatch.setattr(zarr_files, "sync_file", sync_file)
         monkeypatch.setattr(zarr_store, "sync_file", sync_file)
         monkeypatch.setattr(zarr_store, "replace_file", replace_file)
         write(path, result(), 10)

@@ -16,7 +16,7 @@ from tests.io.frame_files import fits, h5py, tifffile, zarr
 from tests.io.slope_files import result, write
 
 from faintspot.base.files import read_arrays
-from faintspot.io import open_frames, read_array, read_slopes, slopes_format
+from faintspot.io import file_format, open_frames, read_array, read_slopes
 from faintspot.io.fits_units import units_of
 from faintspot.io.slopes import read_reference
 from faintspot.io.zarr_store import check_inflated
@@ -40,7 +40,7 @@ def small_limits(monkeypatch: pytest.MonkeyPatch) -> None:
     ):
         monkeypatch.setattr(f"faintspot.io.{module}.MOST_WHOLE_BYTES", 8 * MIB)
     monkeypatch.setattr(read_arrays, "__defaults__", (None, (), 8 * MIB))
-    monkeypatch.setattr(slopes_format, "memory_bytes", lambda: 16 * MIB)
+    monkeypatch.setattr(file_format, "memory_bytes", lambda: 16 * MIB)
 
 
 @contextmanager

@@ -20,7 +20,7 @@ from tests.refusals import refused
 
 from faintspot.base.errors import MissingExtraError
 from faintspot.base.flags import VARIABLES
-from faintspot.io import open_frames, read_slopes, slopes_format
+from faintspot.io import file_format, open_frames, read_slopes
 from faintspot.io.formats import csv_files
 
 fits = pytest.importorskip("astropy.io.fits")
@@ -125,7 +125,7 @@ def test_damaged_chunk_of_a_store(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, damage: str
 ) -> None:
     """Also where all values are 0, which is the fill value."""
-    monkeypatch.setattr("faintspot.io.slopes_zarr._CHUNK_NUMBERS", 70)
+    monkeypatch.setattr("faintspot.io.formats.zarr_files._CHUNK_NUMBERS", 70)
     whole = result()
     whole["flags"][20:30] = 0
     store = tmp_path / "slopes.zarr"
@@ -188,5 +188,5 @@ class TestWithoutZarr:
             writer_for(tmp_path / "slopes.npz")
 
     def test_more_than_fits_in_memory(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr(slopes_format, "memory_bytes", lambda: 20_000)
+        monkeypatch.setattr(file_format, "memory_bytes", lambda: 20_000)
         assert_refused(tmp_path / "slopes.npz", "of memory, expected slopes of at most")

@@ -12,7 +12,8 @@ from tests.io.slope_files import assert_alone, assert_stored, part, result, stor
 from tests.shared_data import ROOT
 
 import faintspot
-from faintspot.io import read_slopes, slopes_writer, slopes_zarr
+from faintspot.io import read_slopes, slopes_writer
+from faintspot.io.formats import zarr_files
 
 pytestmark = pytest.mark.slow
 
@@ -21,7 +22,7 @@ KILLED = """
 import sys
 from pathlib import Path
 sys.path[:0] = sys.argv[2:]
-from faintspot.io import slopes_zarr
+from faintspot.io.formats import zarr_files
 from tests.io import slope_files as t
 slopes_zarr._CHUNK_NUMBERS = 70
 whole = t.result(1000)
@@ -66,7 +67,7 @@ def finished(store: Path) -> int:
 @pytest.mark.parametrize("line", range(14))
 def test_ctrl_c_at_any_line_of_the_writer(tmp_path: Path, line: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """Whichever line is reached when the signal comes, no frame is stored twice or lost."""
-    monkeypatch.setattr(slopes_zarr, "_CHUNK_NUMBERS", 70)
+    monkeypatch.setattr(zarr_files, "_CHUNK_NUMBERS", 70)
     monkeypatch.setattr(slopes_writer, "_MARK_SECONDS", 0.0)
     whole, n_lines = result(), -1
 

@@ -37,6 +37,7 @@ _HOMES = {
     "export": "report:export",
     "layout": "layout.command:command",
     "live": "realtime.run:live",
+    "loop": "study:loop_group",
 }
 """Module and function of commands whose module is not named after them."""
 _OF_POSIX = ("fcntl", "resource")
@@ -86,8 +87,8 @@ def _print_versions(context: click.Context, _: click.Parameter, asked: bool) -> 
         return
     from importlib.metadata import version
 
-    from faintspot.slopes.kernels.compilation.compiling import compile_target
-    from faintspot.slopes.kernels.compilation.host import lanes_for
+    from faintspot.slopes.kernels.compiling import compile_target
+    from faintspot.slopes.kernels.host import lanes_for
 
     packages = ", ".join(f"{name} {version(name)}" for name in ("numpy", "scipy", "numba", "llvmlite"))
     click.echo(f"faintspot, version {__version__}, in {Path(__file__).parents[1]}")
@@ -148,7 +149,7 @@ def main(arguments: list[str] | None = None) -> object:
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     warnings.formatwarning = lambda message, *_: f"faintspot: warning: {' '.join(str(message).split())}\n"
     if sys.stderr.isatty():
-        compiling = logging.getLogger("faintspot.slopes.kernels.compilation.compiling")
+        compiling = logging.getLogger("faintspot.slopes.kernels.compiling")
         compiling.addHandler(_Terminal())
         compiling.setLevel(logging.INFO)
     try:

@@ -13,10 +13,8 @@ from rich.console import Console
 from faintspot.base.errors import InputError
 from faintspot.base.files import write_atomically
 from faintspot.base.report.texts import with_interval
-from faintspot.cli.shared.commands import option
-from faintspot.cli.shared.needs import can_make
-from faintspot.cli.shared.output import results_table
-from faintspot.cli.shared.progress import progress_bar
+from faintspot.cli.commands import can_make, option
+from faintspot.cli.output import progress_bar, results_table
 from faintspot.experiments import demonstration
 from faintspot.experiments.demonstration import Comparison
 from faintspot.io.slopes import read_slopes

@@ -8,8 +8,7 @@ import click
 
 from faintspot.base.errors import InputError
 from faintspot.base.files import derived
-from faintspot.cli.shared.commands import option
-from faintspot.cli.shared.needs import needs
+from faintspot.cli.commands import needs, option
 from faintspot.experiments.store import kind_of_store
 from faintspot.io.stored_array import split_location
 from faintspot.io.zarr_store import holds_telemetry

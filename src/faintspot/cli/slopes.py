@@ -11,10 +11,10 @@ import click
 from faintspot.base.errors import InputError, MissingExtraError, has_zarr
 from faintspot.base.flags import SubapertureFlag
 from faintspot.base.tables import parse_changes
-from faintspot.cli.shared.commands import KEY, NAMES, REFERENCE, configuration_option, option
-from faintspot.cli.shared.progress import progress_bar
+from faintspot.cli.commands import KEY, NAMES, REFERENCE, configuration_option, option
+from faintspot.cli.output import progress_bar
+from faintspot.io.file_format import UNITS
 from faintspot.io.formats.registry import slope_format
-from faintspot.io.slopes_format import UNITS
 from faintspot.io.stored_array import split_location
 from faintspot.slopes.recorded import Summary, measure_recorded
 

@@ -11,9 +11,8 @@ import numpy as np
 from faintspot.base.errors import InputError
 from faintspot.base.files import derived
 from faintspot.base.tables import save_tables
-from faintspot.cli.shared.commands import KEY, configuration_option, option
-from faintspot.cli.shared.output import picture_file, write_picture
-from faintspot.cli.shared.progress import progress_bar
+from faintspot.cli.commands import KEY, configuration_option, option
+from faintspot.cli.output import picture_file, progress_bar, write_picture
 from faintspot.io.frames import open_frames
 from faintspot.slopes.pipeline.configuration import Configuration
 from faintspot.slopes.recorded.sodium import MOST_FRAMES, sodium_of_frames

@@ -14,9 +14,8 @@ from faintspot.base.checks import not_none
 from faintspot.base.errors import InputError, errors_within, require, require_linux
 from faintspot.base.files import derived, write_atomically
 from faintspot.base.text_files import to_json
-from faintspot.cli.shared.commands import SectionedCommand, declared, option
-from faintspot.cli.shared.needs import needs
-from faintspot.cli.shared.progress import progress_bar
+from faintspot.cli.commands import SectionedCommand, declared, needs, option
+from faintspot.cli.output import progress_bar
 from faintspot.slopes.sensor.layout import OPTICS, Layout
 
 if TYPE_CHECKING:

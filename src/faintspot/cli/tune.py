@@ -15,14 +15,25 @@ from rich.console import Console
 
 from faintspot.base.errors import InputError
 from faintspot.base.tables import save_tables
-from faintspot.cli.shared.commands import SectionedCommand, declared, flag_of, option, which_frames
-from faintspot.cli.shared.needs import suggested_slopes
-from faintspot.cli.shared.output import check_target, picture_file, results_table, wrapped, write_picture
-from faintspot.cli.shared.progress import progress_bar
+from faintspot.cli.commands import (
+    SectionedCommand,
+    declared,
+    flag_of,
+    option,
+    suggested_slopes,
+    which_frames,
+)
+from faintspot.cli.output import (
+    check_target,
+    picture_file,
+    progress_bar,
+    results_table,
+    wrapped,
+    write_picture,
+)
 from faintspot.experiments.planner import text as answer_text
 from faintspot.experiments.planner.question import Question
-from faintspot.slopes.camera.binning import binned, binned_calibration, camera_calibration
-from faintspot.slopes.camera.calibration import Calibration
+from faintspot.slopes.camera.calibration import Calibration, binned, binned_calibration, camera_calibration
 from faintspot.slopes.estimators.registry import allowed_in_words, estimator_named, estimators, needs_in_words
 from faintspot.slopes.pipeline import configuration
 from faintspot.slopes.sensor.binning import binned_layout

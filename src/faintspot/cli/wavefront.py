@@ -11,9 +11,8 @@ import numpy as np
 
 from faintspot.base.errors import InputError
 from faintspot.base.files import derived
-from faintspot.cli.shared.commands import SectionedCommand, declared, errors_of_options, option
-from faintspot.cli.shared.needs import can_make
-from faintspot.cli.shared.output import picture_file, write_picture
+from faintspot.cli.commands import SectionedCommand, can_make, declared, errors_of_options, option
+from faintspot.cli.output import picture_file, write_picture
 from faintspot.io.frames import read_array
 from faintspot.loop.control.flattening import Flattening, check_command_file, flattening, save_command
 from faintspot.slopes.pipeline.slopes import Slopes

@@ -17,8 +17,8 @@ from faintspot.engine.path.workers import SlopePrior
 from faintspot.loop.control.base import KALMAN, CommandDelayLine, Controller
 from faintspot.loop.control.configuration import Control
 from faintspot.loop.control.integrator import MEAN_SQUARE, true_slopes
-from faintspot.slopes.kernels.compilation.compiling import Direct
-from faintspot.slopes.kernels.driver.products import ProductPart
+from faintspot.slopes.kernels.compiling import Direct
+from faintspot.slopes.kernels.products import ProductPart
 from faintspot.slopes.pipeline.slopes import RESULT_TYPES, Slopes
 from faintspot.slopes.sensor.layout import Layout
 

@@ -19,7 +19,7 @@ from faintspot.loop.control.integrator import (
     displaced_flux,
 )
 from faintspot.loop.control.options import CONTROLLER
-from faintspot.slopes.kernels.compilation.compiling import Direct
+from faintspot.slopes.kernels.compiling import Direct
 from faintspot.slopes.sensor.layout import Layout
 
 Floats = NDArray[np.float64]

@@ -24,7 +24,7 @@ from faintspot.engine.streams.command_stream import CommandStream
 from faintspot.engine.streams.shared_streams import create_stream, held
 from faintspot.loop.simulation.configuration import LoopConfiguration
 from faintspot.loop.simulation.telescope import TelescopeModel, make_detector
-from faintspot.loop.turbulence.slope_covariance import ARCSEC
+from faintspot.loop.slope_covariance import ARCSEC
 from faintspot.slopes.spots.von_karman import R0_WAVELENGTH_M
 
 ORDERS = ("photons", "magnitude", "r0_m", "seeing_arcsec", "wind_factor")

@@ -17,7 +17,7 @@ from faintspot.base.statistics import Estimate, absolute_errors
 from faintspot.experiments.curves import Curve, Gain, gain_at_flux
 from faintspot.experiments.methods import NO_TV, TV, TV_OVER_NO_TV
 from faintspot.slopes.camera.calibration import Calibration
-from faintspot.slopes.estimators.algorithms.noise import suggested_strength
+from faintspot.slopes.estimators.noise import suggested_strength
 from faintspot.slopes.pipeline.settings import Settings
 from faintspot.slopes.pipeline.slope_pipeline import SlopePipeline
 from faintspot.slopes.sensor.layout import Layout

@@ -14,21 +14,20 @@ from faintspot.base.checks import finite_array, number_between, one_of
 from faintspot.base.errors import InputError, MissingExtraError, errors_within, has_zarr
 from faintspot.base.files import check_regular, output_errors
 from faintspot.base.flags import VARIABLES, leave_out, scaled_positions
-from faintspot.io.formats.file_format import FileFormat
-from faintspot.io.formats.registry import slope_endings, slope_format
-from faintspot.io.formats.zarr_files import Zarr
-from faintspot.io.frames import read_array
-from faintspot.io.slopes_format import (
+from faintspot.io.file_format import (
     RESERVED_ATTRIBUTES,
     UNITS,
+    FileFormat,
     RecordingHeader,
     StoredSlopes,
     check_memory,
     json_values,
     pixels_in,
 )
+from faintspot.io.formats.registry import slope_endings, slope_format
+from faintspot.io.formats.zarr_files import SlopeStore, Zarr, describe_store, remove_store
+from faintspot.io.frames import read_array
 from faintspot.io.slopes_writer import OutputLock, SlopeWriter
-from faintspot.io.slopes_zarr import SlopeStore, describe_store, remove_store
 from faintspot.io.stored_array import one_line, split_location
 
 _Result = TypeVar("_Result")

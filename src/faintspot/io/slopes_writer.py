@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from faintspot.base.errors import InputError, load_filelock
 from faintspot.base.files import Closing, output_errors, replace_file
 from faintspot.base.flags import VARIABLES
-from faintspot.io.slopes_format import RecordingHeader, StoredSlopes, checked_block
-from faintspot.io.slopes_zarr import SlopeStore, remove_store
+from faintspot.io.file_format import RecordingHeader, StoredSlopes, checked_block
+from faintspot.io.formats.zarr_files import SlopeStore, remove_store
 
 # On file systems without locks, a file that names its process is the lock.
 _NO_LOCKS = (errno.ENOLCK, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOSYS)

@@ -7,7 +7,7 @@ from tests.cli.cli_cases import Commands
 from tests.experiments.experiment_cases import SEARCH, small
 from tests.experiments.result_cases import made_up_magnitude
 
-from faintspot.cli import loop as command
+from faintspot.cli import study as command
 from faintspot.experiments.closed_loop import magnitude
 from faintspot.experiments.closed_loop.results import MagnitudeResult
 from faintspot.experiments.night import page, protocol

@@ -16,9 +16,9 @@ from faintspot.engine.path.frame_path import FramePath, Progress, last_rows_of_g
 from faintspot.engine.path.workers import Workers
 from faintspot.loop.control import integrator
 from faintspot.loop.control.integrator import SlopeProduct
-from faintspot.slopes.kernels.compilation.ordered import store
-from faintspot.slopes.kernels.driver.groups import SlopeArrays
-from faintspot.slopes.kernels.driver.streaming import (
+from faintspot.slopes.kernels.groups import SlopeArrays
+from faintspot.slopes.kernels.ordered import store
+from faintspot.slopes.kernels.streaming import (
     COLD,
     LAST_ROW,
     MARGIN,

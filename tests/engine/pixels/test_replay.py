@@ -17,9 +17,9 @@ from faintspot.base.errors import InputError
 from faintspot.cli.realtime import sources as realtime_sources
 from faintspot.cli.realtime.sources import replay
 from faintspot.engine.child_processes import quick_switching
-from faintspot.engine.pixels import replay as replay_module
+from faintspot.engine.pixels import readout as replay_module
 from faintspot.engine.pixels.pixel_ring import PixelRing
-from faintspot.engine.pixels.replay import Replay, ring_type
+from faintspot.engine.pixels.readout import Replay, ring_type
 from faintspot.engine.pixels.segment import FOLDER
 from faintspot.io import FrameSource, open_frames
 

@@ -15,10 +15,9 @@ from tests.refusals import refused
 
 from faintspot.base.flags import VARIABLES
 from faintspot.io import open_frames
+from faintspot.io.file_format import FileFormat, StoredSlopes
 from faintspot.io.fits_units import StreamedArray
 from faintspot.io.formats import registry
-from faintspot.io.formats.file_format import FileFormat
-from faintspot.io.slopes_format import StoredSlopes
 from faintspot.io.stored_array import StoredArray
 
 

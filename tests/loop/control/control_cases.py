@@ -7,7 +7,7 @@ from faintspot.loop.control.flattening import phase_of_commands
 from faintspot.loop.control.integrator import LoopPlant
 from faintspot.loop.control.kalman.predictor import SlopeModel
 from faintspot.loop.control.reconstructor import make_reconstructor
-from faintspot.loop.turbulence.slope_covariance import SlopeTurbulence
+from faintspot.loop.slope_covariance import SlopeTurbulence
 
 FRAME_S = 0.004
 CELLS = np.array([[row, column] for row in range(3) for column in range(3)], np.float64)

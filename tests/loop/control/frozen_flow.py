@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from faintspot.loop.turbulence.slope_covariance import SlopeTurbulence
+from faintspot.loop.slope_covariance import SlopeTurbulence
 from faintspot.slopes.spots.von_karman import R0_WAVELENGTH_M, SPECTRUM
 
 WAVES = 1500

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from faintspot.base.flags import SubapertureFlag
 from faintspot.loop.control import integrator
 from faintspot.loop.control.integrator import SlopeProduct
-from faintspot.slopes.kernels.driver.products import add_slopes
+from faintspot.slopes.kernels.products import add_slopes
 
 N, COMMANDS, SCALE = 45, 31, 1.25
 MATRIX = np.random.default_rng(1).standard_normal((COMMANDS, 2 * N))

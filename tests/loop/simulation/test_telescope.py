@@ -7,10 +7,9 @@ from faintspot.loop.simulation.telescope import (
     make_detector,
 )
 from faintspot.slopes.estimators.base import Estimator
-from faintspot.slopes.estimators.built_in.gravity import BrightestPixels
+from faintspot.slopes.estimators.built_in.gravity import BrightestPixels, Thresholded
 from faintspot.slopes.estimators.built_in.maximum_likelihood import MaximumAPosteriori, MaximumLikelihood
 from faintspot.slopes.estimators.built_in.smoothed import Smoothed
-from faintspot.slopes.estimators.built_in.thresholded import Thresholded
 from faintspot.slopes.estimators.built_in.total_variation import TotalVariation
 
 

@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 
 from faintspot.loop.control.flattening import residual_phase
 from faintspot.loop.control.reconstructor import make_reconstructor
+from faintspot.loop.slope_covariance import ARCSEC
 from faintspot.loop.telemetry.alternation import AlternatingLoop
-from faintspot.loop.turbulence.slope_covariance import ARCSEC
 
 Floats = NDArray[np.float64]
 

@@ -8,7 +8,7 @@ from tests.loop.control.frozen_flow import frozen_slopes
 
 from faintspot.loop.control.identification.recording import Recording
 from faintspot.loop.control.reconstructor import make_reconstructor
-from faintspot.loop.turbulence.slope_covariance import ARCSEC, SlopeTurbulence
+from faintspot.loop.slope_covariance import ARCSEC, SlopeTurbulence
 
 RATE_HZ, NOISE_PX, LOOP_GAIN = 250.0, 0.3, 0.35
 CELLS = np.argwhere(np.ones((5, 5)))

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from faintspot import Calibration
-from faintspot.slopes.camera.binning import binned, binned_calibration, camera_calibration, spread
+from faintspot.slopes.camera.calibration import binned, binned_calibration, camera_calibration, spread
 
 
 def test_sums_of_blocks_without_the_rest() -> None:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from tests.patience import LIMIT_S
 
-from faintspot.slopes.kernels.compilation.host import lanes_for
+from faintspot.slopes.kernels.host import lanes_for
 from faintspot.slopes.kernels.parallel import available_cpus, run_groups
 
 pytestmark = pytest.mark.slow

@@ -10,7 +10,7 @@ from tests.simulated import frames_of
 
 import faintspot as fs
 from faintspot import Calibration, InputError, Layout, MissingExtraError, Settings, SlopePipeline, Slopes
-from faintspot.slopes.kernels.driver.groups import SlopeArrays
+from faintspot.slopes.kernels.groups import SlopeArrays
 
 LAYOUT = fs.Layout.grid((7, 7), pixels=8, outer_radius=3.5, inner_radius=0.5)
 

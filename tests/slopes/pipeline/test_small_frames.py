@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import faintspot as fs
-from faintspot.slopes.kernels.driver.groups import SlopeArrays
+from faintspot.slopes.kernels.groups import SlopeArrays
 
 LAYOUT = fs.Layout.grid((3, 3), pixels=8)
 

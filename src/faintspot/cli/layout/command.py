@@ -16,6 +16,17 @@ from numpy.typing import NDArray
 
 from faintspot.base.errors import DoubtWarning, InputError
 from faintspot.base.tables import save_tables
+from faintspot.cli.commands import (
+    KEY,
+    NAMES,
+    RANGES,
+    Listed,
+    SectionedCommand,
+    declared,
+    errors_of_options,
+    option,
+    suggested_slopes,
+)
 from faintspot.cli.layout import options as layout_options
 from faintspot.cli.layout.completing import (
     clearer_frame,
@@ -27,21 +38,9 @@ from faintspot.cli.layout.completing import (
 )
 from faintspot.cli.layout.describing import describe, describe_settings, doubts_of
 from faintspot.cli.layout.options import plain
-from faintspot.cli.shared.commands import (
-    KEY,
-    NAMES,
-    RANGES,
-    Listed,
-    SectionedCommand,
-    declared,
-    errors_of_options,
-    option,
-)
-from faintspot.cli.shared.needs import suggested_slopes
-from faintspot.cli.shared.output import picture_file
+from faintspot.cli.output import picture_file
 from faintspot.io.frames import FrameSource, open_frames
-from faintspot.slopes.camera.binning import binned
-from faintspot.slopes.camera.calibration import Calibration
+from faintspot.slopes.camera.calibration import Calibration, binned
 from faintspot.slopes.camera.frame_checks import MeanFrame, find_hot_pixels, misread, mosaic_contrast
 from faintspot.slopes.pipeline import configuration
 from faintspot.slopes.pipeline.settings import Settings

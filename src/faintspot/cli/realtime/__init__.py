@@ -7,7 +7,7 @@ from importlib import import_module
 
 import click
 
-from faintspot.cli.shared.needs import needs_linux
+from faintspot.cli.commands import needs_linux
 
 _MODULES = {
     **dict.fromkeys(("calibrate", "learn"), "learn"),

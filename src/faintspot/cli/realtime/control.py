@@ -10,8 +10,8 @@ import click
 from faintspot.base.errors import InputError
 from faintspot.base.tables import parse_changes
 from faintspot.base.text_files import check_keys, to_json
-from faintspot.cli.shared.commands import ENGINE_NAME, RANGES, option
-from faintspot.cli.shared.engine_requests import (
+from faintspot.cli.commands import ENGINE_NAME, RANGES, needs, option
+from faintspot.cli.realtime.engine_requests import (
     asked,
     asked_at_length,
     loop_in_words,
@@ -19,7 +19,6 @@ from faintspot.cli.shared.engine_requests import (
     stop_on_signal,
     summary,
 )
-from faintspot.cli.shared.needs import needs
 from faintspot.engine.requests import ENGINE, TELESCOPE, since
 
 if TYPE_CHECKING:
@@ -259,7 +258,7 @@ def record(out: Path, name: str, frames: int | None, seconds: float | None) -> N
 
 def record_engine(name: str, store: Path, frames: int | None, seconds: float | None) -> RecordingReport:
     """Record a running engine to a new store, with a progress bar, until a limit or Ctrl-C."""
-    from faintspot.cli.shared.progress import progress_bar
+    from faintspot.cli.output import progress_bar
     from faintspot.engine.telemetry.recorder import Recorder
 
     recorder = Recorder(name, store)

@@ -10,9 +10,8 @@ import click
 
 from faintspot.base.errors import InputError, MissingExtraError, require_linux
 from faintspot.base.files import derived
-from faintspot.cli.shared.commands import ENGINE_NAME, configuration_option, name_option, option
-from faintspot.cli.shared.needs import needs
-from faintspot.cli.shared.progress import progress_bar
+from faintspot.cli.commands import ENGINE_NAME, configuration_option, name_option, needs, option
+from faintspot.cli.output import progress_bar
 
 
 @needs("realtime", "zarr")

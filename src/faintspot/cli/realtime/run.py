@@ -15,17 +15,17 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from faintspot.base.errors import require, require_linux
-from faintspot.cli.shared.commands import (
+from faintspot.cli.commands import (
     ENGINE_NAME,
     FRAMES,
     PORT,
     RANGES,
     configuration_option,
     name_option,
+    needs,
     option,
 )
-from faintspot.cli.shared.engine_requests import stop_on_signal, summary
-from faintspot.cli.shared.needs import needs
+from faintspot.cli.realtime.engine_requests import stop_on_signal, summary
 from faintspot.engine.requests import socket_path
 
 if TYPE_CHECKING:

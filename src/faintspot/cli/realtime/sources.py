@@ -11,10 +11,9 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from faintspot.base.errors import InputError
-from faintspot.cli.shared.commands import FRAMES, KEY, name_option, option
-from faintspot.cli.shared.engine_requests import published, stop_on_signal
-from faintspot.cli.shared.needs import needs
-from faintspot.cli.shared.progress import progress_bar
+from faintspot.cli.commands import FRAMES, KEY, name_option, needs, option
+from faintspot.cli.output import progress_bar
+from faintspot.cli.realtime.engine_requests import published, stop_on_signal
 
 if TYPE_CHECKING:
     from faintspot.engine.streams.command_stream import StreamOut
@@ -69,7 +68,7 @@ def replay(
     """
     from faintspot.engine.child_processes import quick_switching
     from faintspot.engine.pixels.pixel_ring import PixelRing
-    from faintspot.engine.pixels.replay import Replay, ring_type
+    from faintspot.engine.pixels.readout import Replay, ring_type
     from faintspot.io import open_frames
 
     repeat = options["repeat"]

@@ -13,10 +13,9 @@ import click
 from rich.console import Console
 
 from faintspot.base.files import output_errors
-from faintspot.cli.shared.commands import FRAMES, PORT, READOUT_FRACTION, name_option, option
-from faintspot.cli.shared.engine_requests import published, stop_on_signal
-from faintspot.cli.shared.needs import needs
-from faintspot.cli.shared.output import results_table
+from faintspot.cli.commands import FRAMES, PORT, READOUT_FRACTION, name_option, needs, option
+from faintspot.cli.output import results_table
+from faintspot.cli.realtime.engine_requests import published, stop_on_signal
 from faintspot.engine.requests import TELESCOPE, socket_path
 
 if TYPE_CHECKING:

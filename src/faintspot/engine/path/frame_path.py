@@ -17,11 +17,11 @@ from numpy.typing import NDArray
 from faintspot.base.errors import InputError
 from faintspot.engine.path.workers import SlopePrior, Workers
 from faintspot.loop.control.configuration import prior_std_px
-from faintspot.slopes.kernels.compilation.compiling import Direct
-from faintspot.slopes.kernels.compilation.host import WIDTHS, lanes_for
-from faintspot.slopes.kernels.driver.groups import DENOISED, ERROR_SCALE, STAGE_ROWS, SlopeArrays, new_scratch
-from faintspot.slopes.kernels.driver.products import NO_PRODUCT, ProductPart
-from faintspot.slopes.kernels.driver.streaming import (
+from faintspot.slopes.kernels.compiling import Direct
+from faintspot.slopes.kernels.groups import DENOISED, ERROR_SCALE, STAGE_ROWS, SlopeArrays, new_scratch
+from faintspot.slopes.kernels.host import WIDTHS, lanes_for
+from faintspot.slopes.kernels.products import NO_PRODUCT, ProductPart
+from faintspot.slopes.kernels.streaming import (
     COLD,
     LAST_ROW,
     MARGIN,
@@ -88,7 +88,7 @@ class _Groups:
         task = pipeline.plan.task(np.zeros(1, np.int64), None if prior is None else prior.mean_px)
         task = task._replace(settings=task.settings.copy())
         self.settings: NDArray[np.float32] = task.settings[0]
-        """Settings of every sub-aperture for the kernel: rows as in `kernels.driver.groups`."""
+        """Settings of every sub-aperture for the kernel: rows as in `kernels.groups`."""
         self._work = [(pipeline.source(slot[None], slot.dtype), task) for slot in slots]
         self._width, self._frame_rows = pipeline.width, int(last_rows_of_groups(pipeline, 1).max())
         self._kernel = Direct(streamed(pipeline.plan.prepared.kernel))

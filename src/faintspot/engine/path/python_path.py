@@ -21,8 +21,8 @@ from faintspot.engine.path.frame_path import FramePath, check_real_time
 from faintspot.slopes.estimators.base import Positions
 from faintspot.slopes.estimators.python import PythonPlan
 from faintspot.slopes.estimators.registry import one_line
-from faintspot.slopes.kernels.driver.groups import CALIBRATED
-from faintspot.slopes.kernels.driver.products import ProductPart
+from faintspot.slopes.kernels.groups import CALIBRATED
+from faintspot.slopes.kernels.products import ProductPart
 from faintspot.slopes.pipeline.settings import Settings
 from faintspot.slopes.pipeline.slope_pipeline import SlopePipeline
 

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from faintspot.base.errors import InputError
 from faintspot.slopes.camera.calibration import Calibration
-from faintspot.slopes.kernels.compilation.ordered import load, store
-from faintspot.slopes.kernels.driver import streaming
+from faintspot.slopes.kernels import streaming
+from faintspot.slopes.kernels.ordered import load, store
 from faintspot.slopes.pipeline.settings import Settings
 from faintspot.slopes.pipeline.slope_pipeline import SlopePipeline
 from faintspot.slopes.sensor.layout import Layout

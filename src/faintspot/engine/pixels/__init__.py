@@ -1,1 +1,1 @@
-"""Pixels in shared memory: `segment` and `pixel_ring`, filled by a `readout`, such as `replay`."""
+"""Pixels in shared memory: `segment` and `pixel_ring`, filled by a `readout`, also of recorded frames."""

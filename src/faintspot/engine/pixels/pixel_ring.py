@@ -10,7 +10,7 @@ arrival and time of the last row. Frame n lies in slot n % slots.
 
 The writer stores pixels first and progress afterwards, each number as one aligned 8-byte store. The reader
 loads progress first, and checks the slot's cell again after using the pixels.
-`faintspot.slopes.kernels.compilation.ordered` enforces this order on processors with weaker memory ordering.
+`faintspot.slopes.kernels.ordered` enforces this order on processors with weaker memory ordering.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from faintspot.engine.pixels.segment import (
     process_start,
     up_to_pages,
 )
-from faintspot.slopes.kernels.compilation.ordered import fence, load, store
+from faintspot.slopes.kernels.ordered import fence, load, store
 
 FRAME, ROWS, ARRIVALS, FIRST_SLOT = range(1, 5)
 """Rows of `PixelRing.cells`; the value is in column 0."""

@@ -35,7 +35,7 @@ from numpy.typing import NDArray
 from faintspot.base.errors import InputError
 from faintspot.base.files import Closing
 from faintspot.base.text_files import parse_json, to_json
-from faintspot.slopes.kernels.compilation.ordered import load, store
+from faintspot.slopes.kernels.ordered import load, store
 
 
 def process_start(pid: int) -> int:

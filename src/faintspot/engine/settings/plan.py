@@ -22,8 +22,8 @@ from faintspot.engine.settings.interleaving import Interleaving
 from faintspot.engine.settings.running_settings import RunningSettings
 from faintspot.slopes.estimators.base import Estimator
 from faintspot.slopes.estimators.registry import estimator_named
-from faintspot.slopes.kernels.compilation.compiling import Direct, compiled_with
-from faintspot.slopes.kernels.driver.dark import BRIGHT, add_windows
+from faintspot.slopes.kernels.compiling import Direct, compiled_with
+from faintspot.slopes.kernels.dark import BRIGHT, add_windows
 from faintspot.slopes.pipeline.light import MeanFlux, MeanLight
 from faintspot.slopes.pipeline.settings import Settings
 from faintspot.slopes.pipeline.slope_pipeline import SlopePipeline

@@ -18,7 +18,7 @@ from faintspot.base.checks import numbers_between
 from faintspot.base.errors import InputError
 from faintspot.base.options import PerSubaperture
 from faintspot.base.text_files import check_known
-from faintspot.slopes.estimators.spots import Stepping
+from faintspot.slopes.estimators.built_in.weighted import Stepping
 from faintspot.slopes.pipeline.settings import Settings, check_option, option_names
 from faintspot.slopes.sensor.layout import Layout
 

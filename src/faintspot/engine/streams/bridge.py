@@ -18,8 +18,7 @@ import numpy as np
 
 from faintspot.base.checks import not_none, number_between
 from faintspot.engine.pixels.pixel_ring import PixelRing
-from faintspot.engine.pixels.readout import StopEvent
-from faintspot.engine.pixels.replay import ring_type
+from faintspot.engine.pixels.readout import StopEvent, ring_type
 from faintspot.engine.streams.stream import Follower, Stream, StreamCounters
 
 SPIN_S = 0.02

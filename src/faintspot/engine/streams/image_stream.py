@@ -36,7 +36,7 @@ from faintspot.engine.streams.image_layout import (
     path_of,
     places_of,
 )
-from faintspot.slopes.kernels.compilation.ordered import fence, load, store
+from faintspot.slopes.kernels.ordered import fence, load, store
 
 LARGEST_NUMBER = 2**63 - 1
 """Largest frame number."""

@@ -22,8 +22,8 @@ from faintspot.engine.streams.shared_streams import (
     pyshmem_module,
 )
 from faintspot.engine.streams.stream import Follower
-from faintspot.slopes.kernels.compilation.compiling import Direct
-from faintspot.slopes.kernels.driver.products import fill_telemetry_rows
+from faintspot.slopes.kernels.compiling import Direct
+from faintspot.slopes.kernels.products import fill_telemetry_rows
 from faintspot.slopes.pipeline.slopes import RESULT_TYPES, Slopes
 
 DETAILS = (

@@ -5,7 +5,7 @@ that is too slow loses the oldest records and gets their number. One segment, NA
 rings: a record for every frame, pixel images of some frames, and changes of settings.
 
 Item k of a ring is in place k % length (see `engine.pixels.segment`). An item is written first and counted
-afterwards (`kernels.compilation.ordered`). The next item overwrites the oldest, which a reader already counts
+afterwards (`kernels.ordered`). The next item overwrites the oldest, which a reader already counts
 as lost.
 """
 
@@ -24,7 +24,7 @@ from faintspot.base.checks import number_between
 from faintspot.base.text_files import parse_json, plain_values, to_json
 from faintspot.engine.pixels.segment import CLOSED, Segment
 from faintspot.io.telemetry import item_type
-from faintspot.slopes.kernels.compilation.ordered import fence, load, store
+from faintspot.slopes.kernels.ordered import fence, load, store
 from faintspot.slopes.pipeline.slopes import Slopes
 from faintspot.slopes.sensor.layout import Layout
 

@@ -18,8 +18,8 @@ from faintspot.loop.simulation.methods import Method
 from faintspot.loop.simulation.record import LoopRecord, make_folder, slope_turbulence
 from faintspot.loop.simulation.sections import CLOSED
 from faintspot.loop.simulation.simulation import simulate_loop
-from faintspot.loop.turbulence.slope_covariance import SlopeTurbulence
-from faintspot.loop.turbulence.strength import turbulence_strength
+from faintspot.loop.slope_covariance import SlopeTurbulence
+from faintspot.loop.turbulence_strength import turbulence_strength
 
 Floats = NDArray[np.float64]
 

@@ -23,7 +23,7 @@ from faintspot.experiments.paper.claims import (
 from faintspot.experiments.study.curves import kept_panels
 from faintspot.experiments.study.specification import BEST
 from faintspot.experiments.study.sweep import PARAMETERS
-from faintspot.slopes.estimators.algorithms.noise import suggested_strength, tv_denoise
+from faintspot.slopes.estimators.noise import suggested_strength, tv_denoise
 from faintspot.slopes.recorded.pictures import assembled
 from faintspot.slopes.sensor.layout import Layout
 from faintspot.slopes.simulate import Detector, spots

@@ -23,7 +23,7 @@ from faintspot.experiments.planner.question import (
 from faintspot.slopes.camera.calibration import Calibration
 from faintspot.slopes.camera.frame_checks import are_repeated
 from faintspot.slopes.camera.photon_transfer import DetectorMeasurement, measure_detector
-from faintspot.slopes.estimators.algorithms.noise import pixel_noise
+from faintspot.slopes.estimators.noise import pixel_noise
 from faintspot.slopes.sensor.layout import Layout
 from faintspot.slopes.spots.psf import PSF
 from faintspot.slopes.spots.shapes import FWHM_OF_SIZE_1_PX

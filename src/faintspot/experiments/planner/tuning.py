@@ -27,8 +27,7 @@ from faintspot.experiments.planner.promise import Promise, check_promises
 from faintspot.experiments.planner.question import Question, SimulatedSpots, SpotFrames
 from faintspot.loop.simulation.methods import Method
 from faintspot.slopes.estimators.base import Estimator
-from faintspot.slopes.estimators.built_in.gravity import BrightestPixels
-from faintspot.slopes.estimators.built_in.thresholded import Thresholded
+from faintspot.slopes.estimators.built_in.gravity import BrightestPixels, Thresholded
 from faintspot.slopes.estimators.registry import estimators
 from faintspot.slopes.pipeline.slopes import Slopes
 from faintspot.slopes.spots.bounds import MEAN_ABSOLUTE, cramer_rao

@@ -1,1 +1,1 @@
-"""File formats: `registry` lists them, `file_format` is the interface, then one file for each."""
+"""File formats: `registry` lists them, then files for each kind; `io.file_format` is the interface."""

@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 from faintspot.base.errors import InputError
 from faintspot.base.files import check_file_size, read_bytes
 from faintspot.base.flags import VARIABLES
-from faintspot.io.formats.file_format import FileFormat
-from faintspot.io.slopes_format import (
+from faintspot.io.file_format import (
     UNITS,
     ExistingOutput,
+    FileFormat,
     StoredSlopes,
     most_slopes_bytes,
     with_absent,

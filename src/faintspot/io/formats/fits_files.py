@@ -20,6 +20,16 @@ from faintspot.base.errors import InputError, load_fits
 from faintspot.base.files import check_bytes
 from faintspot.base.flags import VARIABLES
 from faintspot.base.text_files import parse_json, to_json
+from faintspot.io.file_format import (
+    COORDINATE_UNITS,
+    REQUIRED,
+    FileFormat,
+    StoredSlopes,
+    check_stated,
+    most_slopes_bytes,
+    unit_of,
+    with_absent,
+)
 from faintspot.io.fits_units import (
     AOT_VERSION,
     GZIP_SIGNATURE,
@@ -33,16 +43,6 @@ from faintspot.io.fits_units import (
     is_table,
     open_plain_or_gzip,
     units_of,
-)
-from faintspot.io.formats.file_format import FileFormat
-from faintspot.io.slopes_format import (
-    COORDINATE_UNITS,
-    REQUIRED,
-    StoredSlopes,
-    check_stated,
-    most_slopes_bytes,
-    unit_of,
-    with_absent,
 )
 from faintspot.io.stored_array import StoredArray, one_line
 

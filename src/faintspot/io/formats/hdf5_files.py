@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from faintspot.base.errors import InputError, load_hdf5
 from faintspot.base.files import check_file_size
-from faintspot.io.formats.file_format import FileFormat
+from faintspot.io.file_format import FileFormat
 from faintspot.io.stored_array import MOST_WHOLE_BYTES, StoredArray, choose_name, one_line
 from faintspot.io.zarr_store import check_inflated, is_surely_small
 

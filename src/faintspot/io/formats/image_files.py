@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.errors import InputError, MissingExtraError, load_pillow, load_tifffile
+from faintspot.io.file_format import FileFormat
 from faintspot.io.fits_units import StreamedArray, check_present
-from faintspot.io.formats.file_format import FileFormat
 from faintspot.io.stored_array import CHANNELS, EQUAL_COLOURS, StoredArray, grey, one_channel
 from faintspot.io.zarr_store import check_inflated, is_surely_small
 

@@ -16,9 +16,8 @@ from faintspot.base.errors import InputError
 from faintspot.base.files import check_regular, unpacked
 from faintspot.base.flags import VARIABLES
 from faintspot.base.text_files import parse_json, to_json
+from faintspot.io.file_format import REQUIRED, FileFormat, StoredSlopes, most_slopes_bytes, with_absent
 from faintspot.io.fits_units import StreamedArray, check_present
-from faintspot.io.formats.file_format import FileFormat
-from faintspot.io.slopes_format import REQUIRED, StoredSlopes, most_slopes_bytes, with_absent
 from faintspot.io.stored_array import MOST_WHOLE_BYTES, PREFERRED_NAME, StoredArray, choose_name
 
 _PIECE_NUMBERS = 1 << 18

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from faintspot.base.errors import InputError, import_modules
 from faintspot.base.files import check_regular
-from faintspot.io.formats.file_format import FileFormat
+from faintspot.io.file_format import FileFormat
 
 import_modules(__name__.rpartition(".")[0])
 

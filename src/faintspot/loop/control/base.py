@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from faintspot.loop.control.reconstructor import LARGEST_CORRELATION
 
 if TYPE_CHECKING:
-    from faintspot.slopes.kernels.driver.products import ProductPart
+    from faintspot.slopes.kernels.products import ProductPart
 
 
 Floats = NDArray[np.float64]

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.slopes.kernels.compilation.compiling import Direct, compiled_with
+from faintspot.slopes.kernels.compiling import Direct, compiled_with
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]

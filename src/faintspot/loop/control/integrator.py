@@ -19,8 +19,8 @@ from faintspot.loop.control.base import (
 )
 from faintspot.loop.control.reconstructor import Reconstructor
 from faintspot.loop.control.replay import mean_residual, replayed_frames, replayed_integrators
-from faintspot.slopes.kernels.compilation.compiling import Direct, compiled_with
-from faintspot.slopes.kernels.driver.products import (
+from faintspot.slopes.kernels.compiling import Direct, compiled_with
+from faintspot.slopes.kernels.products import (
     ProductMemory,
     ProductPart,
     add_products,

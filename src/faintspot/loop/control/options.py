@@ -14,7 +14,7 @@ from faintspot.base.flags import UNMEASURED
 from faintspot.base.options import Options, setting
 from faintspot.loop.control.base import CONTROLS, INTEGRATOR
 from faintspot.loop.control.integrator import MEAN_SQUARE
-from faintspot.slopes.kernels.compilation.compiling import Direct, compiled_with
+from faintspot.slopes.kernels.compiling import Direct, compiled_with
 
 Floats = NDArray[np.float64]
 

@@ -29,7 +29,7 @@ from faintspot.loop.simulation.sections import (
     SensorParameters,
     Telescope,
 )
-from faintspot.loop.turbulence.slope_covariance import ARCSEC
+from faintspot.loop.slope_covariance import ARCSEC
 from faintspot.slopes.estimators.sensor import Scene
 from faintspot.slopes.simulate.photometry import Photometry
 from faintspot.slopes.spots.von_karman import R0_WAVELENGTH_M

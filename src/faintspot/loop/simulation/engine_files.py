@@ -23,7 +23,7 @@ from faintspot.loop.simulation.telescope import (
     prepare,
     reference_slopes,
 )
-from faintspot.loop.turbulence.slope_covariance import ARCSEC
+from faintspot.loop.slope_covariance import ARCSEC
 from faintspot.slopes.pipeline import configuration as configuration_file
 from faintspot.slopes.pipeline.settings import Settings
 from faintspot.slopes.spots.fixed_weights import FixedWeights

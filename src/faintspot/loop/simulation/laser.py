@@ -14,7 +14,7 @@ from faintspot.loop.control.options import TIP_TILT, RemovedModes
 from faintspot.loop.simulation.configuration import LoopConfiguration
 from faintspot.loop.simulation.methods import FILTER, FOLLOWED, Method
 from faintspot.loop.simulation.wavefront_sensor import ImageAxis, ShackHartmann
-from faintspot.loop.turbulence.slope_covariance import ARCSEC
+from faintspot.loop.slope_covariance import ARCSEC
 from faintspot.slopes.sensor.layout import Layout
 from faintspot.slopes.spots.fixed_weights import FixedWeights
 from faintspot.slopes.spots.laser import LaserGuideStar, gaussian_spot

@@ -22,7 +22,7 @@ from faintspot.loop.simulation.methods import PRIOR, TRUE, Method
 from faintspot.loop.simulation.record import LoopRecord, plant_of, slope_turbulence
 from faintspot.loop.simulation.sections import CLOSED, ControlParameters, RunLength
 from faintspot.loop.simulation.telescope import prepare
-from faintspot.loop.turbulence.slope_covariance import ARCSEC
+from faintspot.loop.slope_covariance import ARCSEC
 from faintspot.slopes.pipeline.configuration import to_text
 
 Floats = NDArray[np.float64]

@@ -18,7 +18,7 @@ from faintspot.loop.simulation.configuration import LoopConfiguration
 from faintspot.loop.simulation.methods import TRUE, WEIGHTED, Method
 from faintspot.loop.simulation.sections import CLOSED
 from faintspot.loop.simulation.telescope import LoopOptics
-from faintspot.loop.turbulence.slope_covariance import SlopeTurbulence
+from faintspot.loop.slope_covariance import SlopeTurbulence
 
 if TYPE_CHECKING:
     from faintspot.loop.control.identification.model import Kalman

@@ -19,9 +19,9 @@ from numpy.typing import NDArray
 from faintspot.loop.control.flattening import residual_phase
 from faintspot.loop.control.identification.open_loop import noise_variance
 from faintspot.loop.control.reconstructor import make_reconstructor
+from faintspot.loop.slope_covariance import ARCSEC, SlopeTurbulence
 from faintspot.loop.telemetry.recorded_loop import frame_rate
-from faintspot.loop.turbulence.slope_covariance import ARCSEC, SlopeTurbulence
-from faintspot.loop.turbulence.strength import OUTER_SCALE_M
+from faintspot.loop.turbulence_strength import OUTER_SCALE_M
 
 Floats = NDArray[np.float64]
 

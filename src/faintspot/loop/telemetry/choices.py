@@ -29,7 +29,7 @@ from faintspot.loop.control.identification.recording import Recording
 from faintspot.loop.control.integrator import LoopPlant
 from faintspot.loop.control.kalman.predictor import steady_covariance
 from faintspot.loop.control.reconstructor import make_reconstructor
-from faintspot.loop.turbulence.slope_covariance import ARCSEC, SlopeTurbulence
+from faintspot.loop.slope_covariance import ARCSEC, SlopeTurbulence
 
 Floats = NDArray[np.float64]
 

@@ -26,8 +26,8 @@ from faintspot.io.telemetry import read_telemetry
 from faintspot.io.zarr_store import holds_telemetry
 from faintspot.loop.control.configuration import RecordedControl, load_control, unpacked_control
 from faintspot.loop.control.identification.recording import NUMBERS, Recording, cells_of
+from faintspot.loop.slope_covariance import ARCSEC
 from faintspot.loop.telemetry.recording import CLOSED
-from faintspot.loop.turbulence.slope_covariance import ARCSEC
 from faintspot.slopes.recorded.stored_run import open_run
 from faintspot.slopes.sensor.pupil import side_m
 

@@ -15,8 +15,8 @@ from faintspot.loop.control.configuration import Control
 from faintspot.loop.control.identification.open_loop import FEWEST_FRAMES
 from faintspot.loop.control.identification.recording import Recording
 from faintspot.loop.control.options import NONE, STREAM
-from faintspot.loop.turbulence.slope_covariance import ARCSEC, SlopeTurbulence
-from faintspot.loop.turbulence.strength import OUTER_SCALE_M
+from faintspot.loop.slope_covariance import ARCSEC, SlopeTurbulence
+from faintspot.loop.turbulence_strength import OUTER_SCALE_M
 from faintspot.slopes.sensor.layout import Layout
 from faintspot.slopes.sensor.pupil import side_m
 

@@ -29,9 +29,9 @@ from faintspot.loop.control.identification.open_loop import (
     with_axes_of,
 )
 from faintspot.loop.control.identification.recording import Recording, prepared
+from faintspot.loop.slope_covariance import ARCSEC, SlopeTurbulence
 from faintspot.loop.telemetry.spectra import ModalSpectra, modal_spectra, recorded_discrepancy
-from faintspot.loop.turbulence.slope_covariance import ARCSEC, SlopeTurbulence
-from faintspot.loop.turbulence.strength import differential_image_motion, turbulence_strength
+from faintspot.loop.turbulence_strength import differential_image_motion, turbulence_strength
 from faintspot.slopes.sensor.pupil import subapertures_across
 from faintspot.slopes.spots.von_karman import R0_WAVELENGTH_M
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from faintspot.base.errors import InputError
 from faintspot.base.options import Options, is_auto
 from faintspot.slopes.estimators.sensor import Scene, Sensor
-from faintspot.slopes.kernels.driver.groups import COMMON_ROWS, flux_of_groups
+from faintspot.slopes.kernels.groups import COMMON_ROWS, flux_of_groups
 
 Floats = NDArray[np.float64]
 
@@ -246,7 +246,7 @@ class EstimatorPlan:
     """
 
     kernel: Any = None
-    """Compiled function that measures groups of sub-apertures: see `kernels.driver.groups`."""
+    """Compiled function that measures groups of sub-apertures: see `kernels.groups`."""
     setting_rows: int = COMMON_ROWS
     """Number of rows in the settings table."""
     needs_flux: bool = False

@@ -86,7 +86,7 @@ _MODULES = {
     "tv": "total_variation",
     "smoothed": "smoothed",
     "centroid": "gravity",
-    "thresholded": "thresholded",
+    "thresholded": "gravity",
     "window": "window",
     "weighted": "weighted",
     "ml": "maximum_likelihood",

@@ -197,7 +197,7 @@ class Scene:
 
     @property
     def rule_arguments(self) -> dict[str, Any]:
-        """Arguments of the automatic rules, see `faintspot.slopes.estimators.algorithms.automatic`."""
+        """Arguments of the automatic rules, see `faintspot.slopes.estimators.automatic`."""
         return {
             "flux_e": self.flux_e,
             "read_noise_e": self.read_noise_e,

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.slopes.kernels.gravity.smoothing import SMALLEST_VARIANCE
-from faintspot.slopes.kernels.spot_fits.spot_rows import MARGIN, PHASES
+from faintspot.slopes.kernels.smoothing import SMALLEST_VARIANCE
+from faintspot.slopes.kernels.spot_rows import MARGIN, PHASES
 from faintspot.slopes.spots.psf import PSF
 from faintspot.slopes.spots.shapes import FWHM_TO_STD
 
@@ -34,7 +34,7 @@ class SpotModel:
     """Profiles of the spots, or of weights centred on them, as the kernels read them."""
 
     tables: NDArray[np.float32]
-    """(n_models, 2, rank, 2, PHASES, length), see `faintspot.slopes.kernels.spot_fits.spot_rows.look_up`."""
+    """(n_models, 2, rank, 2, PHASES, length), see `faintspot.slopes.kernels.spot_rows.look_up`."""
     index: NDArray[np.int64]
     """Model of each sub-aperture."""
     fwhm_px: Floats
@@ -223,7 +223,7 @@ def least_flux(
 
 @dataclass(frozen=True)
 class PosteriorGrid:
-    """Log-likelihoods of the positions of a grid, see `faintspot.slopes.kernels.spot_fits.means`."""
+    """Log-likelihoods of the positions of a grid, see `faintspot.slopes.kernels.means`."""
 
     tables: NDArray[np.float32]
     constants: NDArray[np.float32]

@@ -9,9 +9,9 @@ from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 from typing import Any
 
-from faintspot.slopes.kernels.compilation.simd import Lanes
-from faintspot.slopes.kernels.driver.groups import Scratch, new_scratch
-from faintspot.slopes.kernels.gravity.gravity import gravity_scratch
+from faintspot.slopes.kernels.gravity import gravity_scratch
+from faintspot.slopes.kernels.groups import Scratch, new_scratch
+from faintspot.slopes.kernels.simd import Lanes
 
 _FEWEST_US = 50.0  # of work for a thread: waking one takes about 30 us
 _US_OF_COST = 1.2  # that a sub-aperture of 16 x 16 px takes whose `cost` is 1

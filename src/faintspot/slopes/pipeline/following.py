@@ -14,10 +14,9 @@ from faintspot.base.checks import LARGEST_FLOAT32, real_array
 from faintspot.base.errors import InputError
 from faintspot.base.flags import UNMEASURED, SubapertureFlag, scaled_positions
 from faintspot.base.statistics import MAD_TO_STD
-from faintspot.slopes.camera.binning import binned
-from faintspot.slopes.camera.calibration import Calibration
+from faintspot.slopes.camera.calibration import Calibration, binned
 from faintspot.slopes.estimators.base import Estimator
-from faintspot.slopes.kernels.driver.doubtful import flag_doubtful
+from faintspot.slopes.kernels.doubtful import flag_doubtful
 from faintspot.slopes.pipeline.light import MeanLight
 from faintspot.slopes.pipeline.settings import Settings
 from faintspot.slopes.pipeline.slope_pipeline import SlopePipeline

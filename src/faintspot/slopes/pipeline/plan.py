@@ -14,10 +14,10 @@ from faintspot.base.options import is_auto
 from faintspot.slopes.camera.calibration import Calibration
 from faintspot.slopes.estimators.base import Estimator, EstimatorPlan
 from faintspot.slopes.estimators.sensor import Sensor
-from faintspot.slopes.kernels.compilation.compiling import Direct
-from faintspot.slopes.kernels.driver import groups
-from faintspot.slopes.kernels.driver.doubtful import Expected
-from faintspot.slopes.kernels.driver.groups import Scratch, SlopeArrays, Source, Task
+from faintspot.slopes.kernels import groups
+from faintspot.slopes.kernels.compiling import Direct
+from faintspot.slopes.kernels.doubtful import Expected
+from faintspot.slopes.kernels.groups import Scratch, SlopeArrays, Source, Task
 from faintspot.slopes.pipeline.settings import Settings, spot_fwhm_px
 from faintspot.slopes.pipeline.slopes import RESULT_TYPES, Slopes
 from faintspot.slopes.sensor.layout import Layout
@@ -109,7 +109,7 @@ class Plan:
             plan = PythonPlan(self.estimator, self.sensor)
         self.prepared: EstimatorPlan = plan
         self.variances: NDArray[np.float32] | None = None
-        """Variance of each dark pixel for the kernel, if it differs: see `kernels.driver.groups.Task`."""
+        """Variance of each dark pixel for the kernel, if it differs: see `kernels.groups.Task`."""
         if self.sensor.has_noise_map:
             self.variances = _packed(self.prepared.pixel_variance[None], width)[:, :, 0]
         self.spot_fwhm_px = self._spot_fwhm(settings)

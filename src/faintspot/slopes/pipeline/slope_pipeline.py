@@ -17,16 +17,15 @@ from numpy.typing import ArrayLike, DTypeLike, NDArray
 from faintspot.base.checks import number_between, numbers_between, real_array
 from faintspot.base.errors import InputError
 from faintspot.base.flags import scaled_positions
-from faintspot.slopes.camera.binning import binned, binned_calibration, spread
-from faintspot.slopes.camera.calibration import Calibration
+from faintspot.slopes.camera.calibration import Calibration, binned, binned_calibration, spread
 from faintspot.slopes.estimators.base import Estimator
-from faintspot.slopes.kernels.compilation.compiling import Direct
-from faintspot.slopes.kernels.compilation.host import lanes_for
-from faintspot.slopes.kernels.compilation.simd import Lanes
-from faintspot.slopes.kernels.driver.dark import scratch_size
-from faintspot.slopes.kernels.driver.doubtful import check_slopes
-from faintspot.slopes.kernels.driver.groups import CALIBRATED, STAGE_ROWS, Scratch, SlopeArrays, Source
+from faintspot.slopes.kernels.compiling import Direct
+from faintspot.slopes.kernels.dark import scratch_size
+from faintspot.slopes.kernels.doubtful import check_slopes
+from faintspot.slopes.kernels.groups import CALIBRATED, STAGE_ROWS, Scratch, SlopeArrays, Source
+from faintspot.slopes.kernels.host import lanes_for
 from faintspot.slopes.kernels.parallel import most_threads, run_groups, thread_scratch
+from faintspot.slopes.kernels.simd import Lanes
 from faintspot.slopes.pipeline import configuration
 from faintspot.slopes.pipeline.light import MeanFlux, MeanLight, light_test
 from faintspot.slopes.pipeline.plan import NO_STAGES, Plan, SmallFrames, packed_calibration

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from faintspot.base.checks import one_of
 from faintspot.base.errors import InputError, MissingExtraError
 from faintspot.base.flags import NO_FLAG, UNMEASURED, VARIABLES, SubapertureFlag, are_valid, scaled_positions
+from faintspot.io.file_format import COORDINATE_UNITS, UNITS, pixels_in, unit_of
 from faintspot.io.formats.csv_files import column_name
-from faintspot.io.slopes_format import COORDINATE_UNITS, UNITS, pixels_in, unit_of
 from faintspot.slopes.sensor.layout import Layout
 
 if TYPE_CHECKING:

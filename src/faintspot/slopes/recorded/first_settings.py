@@ -11,11 +11,10 @@ import scipy.special
 from numpy.typing import NDArray
 
 from faintspot.base.errors import InputError
-from faintspot.slopes.camera.binning import binned, binned_calibration
-from faintspot.slopes.camera.calibration import Calibration
-from faintspot.slopes.estimators.algorithms.centroid import SeenSpots, like_most, seen_spots
-from faintspot.slopes.estimators.algorithms.noise import pixel_noise
+from faintspot.slopes.camera.calibration import Calibration, binned, binned_calibration
 from faintspot.slopes.estimators.base import Need
+from faintspot.slopes.estimators.centroid import SeenSpots, like_most, seen_spots
+from faintspot.slopes.estimators.noise import pixel_noise
 from faintspot.slopes.pipeline.settings import Settings
 from faintspot.slopes.pipeline.slope_pipeline import SlopePipeline
 from faintspot.slopes.sensor.binning import binned_layout

@@ -16,9 +16,9 @@ from faintspot.base import __version__
 from faintspot.base.checks import one_of
 from faintspot.base.errors import InputError, errors_within
 from faintspot.base.flags import SubapertureFlag, kept_flags, scaled_positions
+from faintspot.io.file_format import UNITS, pixels_in
 from faintspot.io.frames import FrameSource, open_frames
 from faintspot.io.slopes import create_writer, read_reference
-from faintspot.io.slopes_format import UNITS, pixels_in
 from faintspot.io.stored_array import split_location
 from faintspot.slopes.camera.calibration import Calibration
 from faintspot.slopes.camera.dark_frames import with_fitting_dark

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from faintspot.base.checks import number_between
 from faintspot.base.errors import InputError
 from faintspot.base.statistics import MAD_TO_STD
-from faintspot.slopes.kernels.driver.doubtful import Expected, flag_doubtful
+from faintspot.slopes.kernels.doubtful import Expected, flag_doubtful
 from faintspot.slopes.sensor.binning import magnified_layout, scaled_points
 from faintspot.slopes.sensor.detection.lenslets import LensletGrid
 from faintspot.slopes.sensor.layout import Layout

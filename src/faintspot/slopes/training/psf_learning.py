@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from faintspot.base.checks import not_none, number_between, numbers_between, one_of, real_array
 from faintspot.base.errors import InputError
 from faintspot.slopes.camera.calibration import Calibration
-from faintspot.slopes.estimators.algorithms.noise import pixel_noise
+from faintspot.slopes.estimators.noise import pixel_noise
 from faintspot.slopes.sensor.layout import Layout
 from faintspot.slopes.spots.psf import PSF
 from faintspot.slopes.training.psf_rounds import (

@@ -6,7 +6,7 @@ import pytest
 
 from faintspot.base.text_files import plain_values
 from faintspot.loop.control.identification.open_loop import Measured, outer_scale_and_r0
-from faintspot.loop.turbulence.strength import TurbulenceStrength
+from faintspot.loop.turbulence_strength import TurbulenceStrength
 
 
 def test_intervals_are_of_95_per_cent() -> None:

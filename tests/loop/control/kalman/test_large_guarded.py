@@ -22,7 +22,7 @@ from faintspot.loop.control.kalman.compiled import Predictive
 from faintspot.loop.control.kalman.guarded import EXCESS, MOST_EXCESS, GuardedController
 from faintspot.loop.control.kalman.large_guarded import LargeGuarded
 from faintspot.loop.control.kalman.local_predictor import LocalPredictor, local_filter
-from faintspot.slopes.kernels.driver.products import add_slopes
+from faintspot.slopes.kernels.products import add_slopes
 
 M, COMMANDS = INTERACTION.shape
 GAIN, FRAMES = 0.4, telemetry(250)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.errors import InputError
-from faintspot.loop.turbulence.slope_covariance import SlopeTurbulence
+from faintspot.loop.slope_covariance import SlopeTurbulence
 
 Floats = NDArray[np.float64]
 Cells = NDArray[np.int64]

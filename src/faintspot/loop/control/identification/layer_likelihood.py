@@ -20,7 +20,7 @@ from scipy.optimize import minimize
 from faintspot.base.errors import InputError
 from faintspot.loop.control.identification.slope_spectra import SlopeRecords, SlopeSpectra
 from faintspot.loop.control.identification.vibrations import MODES, Vibration, mode_shapes
-from faintspot.loop.turbulence.strength import OUTER_SCALE_SPREAD
+from faintspot.loop.turbulence_strength import OUTER_SCALE_SPREAD
 
 Floats = NDArray[np.float64]
 Complex = NDArray[np.complex128]

@@ -26,7 +26,7 @@ from faintspot.loop.control.identification.vibrations import (
     without_passing_grid,
 )
 from faintspot.loop.control.kalman.predictor import SlopeModel
-from faintspot.loop.turbulence.slope_covariance import SlopeTurbulence
+from faintspot.loop.slope_covariance import SlopeTurbulence
 
 Floats = NDArray[np.float64]
 

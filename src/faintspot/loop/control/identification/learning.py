@@ -16,7 +16,7 @@ from faintspot.loop.control.identification.layers import AVERAGED, Identificatio
 from faintspot.loop.control.identification.loop_delay import LoopDelay
 from faintspot.loop.control.identification.model import Kalman
 from faintspot.loop.control.integrator import LoopPlant
-from faintspot.loop.turbulence.slope_covariance import SlopeTurbulence
+from faintspot.loop.slope_covariance import SlopeTurbulence
 
 GAINS = (0.03, 0.05, 0.07, 0.1, 0.13, 0.16, 0.2, 0.25, 0.3, 0.36, 0.43, 0.5, 0.6, 0.7, 0.8)
 """Gains of an integrator that are tried."""

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from faintspot.base.errors import InputError
 from faintspot.loop.control.identification.slope_spectra import SlopeSpectra
-from faintspot.loop.turbulence.slope_covariance import SlopeTurbulence
+from faintspot.loop.slope_covariance import SlopeTurbulence
 
 Floats = NDArray[np.float64]
 

@@ -23,8 +23,8 @@ from faintspot.loop.control.identification.loop_delay import (
 from faintspot.loop.control.identification.modal_delay import ModalFits
 from faintspot.loop.control.identification.modal_loop import plateau
 from faintspot.loop.control.identification.recording import Recording
-from faintspot.loop.turbulence.slope_covariance import ARCSEC, SlopeTurbulence
-from faintspot.loop.turbulence.strength import OUTER_SCALE_M, TurbulenceStrength
+from faintspot.loop.slope_covariance import ARCSEC, SlopeTurbulence
+from faintspot.loop.turbulence_strength import OUTER_SCALE_M, TurbulenceStrength
 
 Floats = NDArray[np.float64]
 

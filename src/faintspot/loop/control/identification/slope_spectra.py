@@ -21,8 +21,8 @@ from scipy.ndimage import spline_filter
 from faintspot.base.errors import InputError
 from faintspot.loop.control.base import OpenLoopTelemetry
 from faintspot.loop.control.identification.vibrations import mode_shapes
-from faintspot.loop.turbulence.slope_covariance import SlopeTurbulence, gradient_covariances
-from faintspot.slopes.kernels.compilation.compiling import compiled_with
+from faintspot.loop.slope_covariance import SlopeTurbulence, gradient_covariances
+from faintspot.slopes.kernels.compiling import compiled_with
 
 Floats = NDArray[np.float64]
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from faintspot.loop.control.base import CommandDelayLine, Controller
 from faintspot.loop.control.faults import StuckWatch
-from faintspot.slopes.kernels.compilation.compiling import Direct, compiled_with
+from faintspot.slopes.kernels.compiling import Direct, compiled_with
 
 MEMORY_FRAMES = 100
 FEWEST_FRAMES = 20  # before the first change

@@ -51,8 +51,8 @@ from faintspot.loop.control.kalman.memory import (
     VARIANCE,
 )
 from faintspot.loop.control.kalman.predictor import LARGEST_VARIANCE_PX2
-from faintspot.slopes.kernels.compilation.compiling import Direct, _kernel
-from faintspot.slopes.kernels.driver.products import add_products
+from faintspot.slopes.kernels.compiling import Direct, _kernel
+from faintspot.slopes.kernels.products import add_products
 
 # Compiled anew when guard, integrator or rows of memory change, too.
 _SOURCES = __file__, guarded.__file__, integrator.__file__, arrays.__file__

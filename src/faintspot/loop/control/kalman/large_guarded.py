@@ -13,7 +13,7 @@ from faintspot.loop.control.integrator import LoopPlant, SlopeProduct
 from faintspot.loop.control.kalman.guarded import SURPRISE, GuardedController
 from faintspot.loop.control.kalman.local_predictor import LocalPredictor
 from faintspot.loop.control.kalman.modal_predictor import ModalPredictor
-from faintspot.slopes.kernels.driver.products import ProductPart
+from faintspot.slopes.kernels.products import ProductPart
 
 Floats = NDArray[np.float64]
 

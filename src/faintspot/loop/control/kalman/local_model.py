@@ -17,7 +17,7 @@ from scipy import sparse
 
 from faintspot.loop.control.kalman.predictor import LARGEST_VARIANCE_PX2
 from faintspot.loop.control.reconstructor import add_noise
-from faintspot.loop.turbulence.slope_covariance import SlopeTurbulence
+from faintspot.loop.slope_covariance import SlopeTurbulence
 
 Floats = NDArray[np.float64]
 Indices = NDArray[np.int32]

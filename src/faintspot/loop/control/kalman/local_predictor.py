@@ -24,8 +24,8 @@ from faintspot.loop.control.kalman.local_model import (
 )
 from faintspot.loop.control.kalman.predictor import LARGEST_VARIANCE_PX2
 from faintspot.loop.control.reconstructor import add_noise
-from faintspot.loop.turbulence.slope_covariance import SlopeTurbulence
-from faintspot.slopes.kernels.compilation.compiling import Direct, compiled_with
+from faintspot.loop.slope_covariance import SlopeTurbulence
+from faintspot.slopes.kernels.compiling import Direct, compiled_with
 
 Floats = NDArray[np.float64]
 _Singles = NDArray[np.float32]

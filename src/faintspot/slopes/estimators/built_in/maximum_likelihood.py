@@ -16,12 +16,12 @@ from faintspot.base.options import Value, option
 from faintspot.base.tables import PRESETS
 from faintspot.slopes.estimators import spot_tables
 from faintspot.slopes.estimators.base import Estimator, Need, Style
+from faintspot.slopes.estimators.built_in.weighted import SpotPlan, Stepping
 from faintspot.slopes.estimators.registry import register
 from faintspot.slopes.estimators.sensor import Scene, Sensor
 from faintspot.slopes.estimators.spot_tables import NO_POSTERIOR, PosteriorGrid, SpotModel, model_of_psf
-from faintspot.slopes.estimators.spots import SpotPlan, Stepping
-from faintspot.slopes.kernels.driver.groups import RANGE, flux_above_edges
-from faintspot.slopes.kernels.spot_fits import fits as spot_fits
+from faintspot.slopes.kernels import fits as spot_fits
+from faintspot.slopes.kernels.groups import RANGE, flux_above_edges
 
 Floats = NDArray[np.float64]
 

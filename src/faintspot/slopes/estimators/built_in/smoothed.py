@@ -10,13 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.options import Value, option
-from faintspot.slopes.estimators.algorithms.automatic import automatic_smoothing
+from faintspot.slopes.estimators.automatic import automatic_smoothing
 from faintspot.slopes.estimators.base import BACKGROUND, CALIBRATED, RAW, Step, Style
 from faintspot.slopes.estimators.built_in.gravity import BrightestPixels, GravityPlan, KeepingBrightest
 from faintspot.slopes.estimators.registry import register
 from faintspot.slopes.estimators.sensor import Scene, Sensor
 from faintspot.slopes.estimators.spot_tables import gaussian_taps
-from faintspot.slopes.kernels.gravity import gravity
+from faintspot.slopes.kernels import gravity
 
 _USUAL_PX = 0.7
 _WIDTHS = (1.0, 0.6, 0.8, 1.3, 1.7)  # multiples of the automatic width

@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 from faintspot.base.errors import InputError
 from faintspot.base.options import PerSubaperture, Value, is_auto, option
 from faintspot.base.tables import FEW_KEPT, PRESETS, of_denoising
-from faintspot.slopes.estimators.algorithms.automatic import automatic_strength
-from faintspot.slopes.estimators.algorithms.noise import ALGORITHMS, suggested_strength, tv_denoise
+from faintspot.slopes.estimators.automatic import automatic_strength
 from faintspot.slopes.estimators.base import BACKGROUND, CALIBRATED, RAW, Estimator, Step, Style
 from faintspot.slopes.estimators.built_in.gravity import (
     BrightestPixels,
@@ -22,10 +21,11 @@ from faintspot.slopes.estimators.built_in.gravity import (
     GravityPlan,
     KeepingBrightest,
 )
+from faintspot.slopes.estimators.noise import ALGORITHMS, suggested_strength, tv_denoise
 from faintspot.slopes.estimators.registry import register
 from faintspot.slopes.estimators.sensor import Scene, Sensor
-from faintspot.slopes.kernels.gravity import gravity
-from faintspot.slopes.kernels.total_variation.flat_start import flat_start_table
+from faintspot.slopes.kernels import gravity
+from faintspot.slopes.kernels.flat_start import flat_start_table
 
 _STRENGTHS = (1.0, 0.4, 0.6, 0.8, 1.25)  # multiples of the automatic strength
 _LEAST_STRENGTH_E = 1e-3
@@ -40,7 +40,7 @@ class TotalVariation(KeepingBrightest):
     noise_std: Any = option(
         None,
         'Denoising strength: standard deviation of the noise to remove from a pixel. "auto": chosen from '
-        "read noise, flux and spot by `estimators.algorithms.automatic.automatic_strength`. 0: no "
+        "read noise, flux and spot by `estimators.automatic.automatic_strength`. 0: no "
         "denoising. A strength above 0.9 of an image's own rms is lowered to 0.6 of it.",
         unit="e-",
         low=0.0,

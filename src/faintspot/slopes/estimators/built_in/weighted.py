@@ -1,23 +1,151 @@
-"""Centre of gravity with a Gaussian weight centred on the spot."""
+"""Centre of gravity with a Gaussian weight; settings rows shared by estimators that know the spot."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
-from typing import Any, ClassVar
+from functools import cached_property, partial
+from typing import Any, ClassVar, Self
 
 import numpy as np
+from numpy.typing import NDArray
 
 from faintspot.base.options import Value, option
 from faintspot.base.tables import PRESETS
 from faintspot.slopes.estimators import spot_tables
-from faintspot.slopes.estimators.base import Need, Style
+from faintspot.slopes.estimators.base import Estimator, EstimatorPlan, Need, Style
 from faintspot.slopes.estimators.registry import register
 from faintspot.slopes.estimators.sensor import Scene, Sensor
 from faintspot.slopes.estimators.spot_tables import SpotModel
-from faintspot.slopes.estimators.spots import SpotPlan, Stepping
-from faintspot.slopes.kernels.spot_fits import fits as spot_fits
+from faintspot.slopes.kernels import fits as spot_fits
+from faintspot.slopes.kernels.groups import RANGE
+from faintspot.slopes.kernels.smoothing import SMALLEST_VARIANCE
+
+Floats = NDArray[np.float64]
+
+_STEPS_IN_BRIGHT_FLUX = 12
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Stepping(Estimator):
+    """Estimator that makes the same number of steps for every image, so that its run time is constant."""
+
+    steps: int | None = option(None, "Number of steps.", low=1, high=100, whole=True, per_subaperture=False)
+
+    usual_steps: ClassVar[Mapping[str, int]] = {"accurate": 3}
+    """By preset."""
+
+    @property
+    def step_count(self) -> int:
+        """Number of steps, given or default."""
+        return int(self.steps or self.usual_steps[getattr(self, "preset", "accurate")])
+
+    def for_bright_flux(self) -> Self:
+        """Make more steps: without noise, the remaining influence of the starting point is a bias."""
+        return self.replaced({"steps": max(self.step_count, _STEPS_IN_BRIGHT_FLUX)})
+
+    def in_words(self, n_subapertures: int, pixels: int) -> str:
+        """See `Estimator`."""
+        own = [name for name in self.chosen() if name not in ("steps", "preset")]
+        parts = [f"{name} {self._span(name, n_subapertures, pixels)}" for name in own]
+        return f"{self.method or self.label} ({', '.join([*parts, f'{self.step_count} steps'])})"
+
+
+_LEVEL = 0.05  # step of the logarithm of variances for which the flux of likely outliers is computed
+_LARGEST_MOVE = 0.25  # in a step, in units of the FWHM; 1 px for narrow spots
+
+
+class SpotPlan(EstimatorPlan):
+    """Settings and tables of an estimator that uses profiles of spots, or of weights centred on them."""
+
+    setting_rows = spot_fits.SETTING_ROWS
+
+    estimator: Stepping
+
+    @cached_property
+    def model(self) -> SpotModel:
+        """Profiles of the spots or of the weights."""
+        raise NotImplementedError
+
+    @cached_property
+    def taps(self) -> NDArray[np.float32]:
+        """Taps of the smoothing in each sub-aperture, (n, 2, 1 + reach)."""
+        return np.ascontiguousarray(self.model.taps[self.model.index])
+
+    @property
+    def step_count(self) -> int:
+        """Number of steps of the fit."""
+        return self.estimator.step_count
+
+    @property
+    def rounds_electrons(self) -> bool:
+        """Whether images are rounded to whole electrons."""
+        return False
+
+    @cached_property
+    def fits_background(self) -> bool:
+        """Whether a constant background is fitted along with the spot."""
+        choice = getattr(self.estimator, "local_background", "off")
+        return choice == "on" or (choice == "auto" and not self.sensor.calibration.dark_is_known)
+
+    @property
+    def model_tables(self) -> spot_fits.ModelTables:
+        """Tables of the kernels that use a profile."""
+        return spot_fits.ModelTables(
+            self.step_count, self.rounds_electrons, self.fits_background, self.taps, self.model.tables
+        )
+
+    @property
+    def tables(self) -> spot_fits.ModelTables | spot_fits.PosteriorTables:
+        """See `EstimatorPlan`."""
+        return self.model_tables
+
+    @cached_property
+    def own_scratch(self) -> partial[spot_fits.SpotScratch]:
+        """See `EstimatorPlan`."""
+        return partial(spot_fits.spot_scratch, rank=self.model.rank, taps=self.taps.shape[2])
+
+    def fill(self, table: NDArray[np.float32]) -> None:
+        """See `EstimatorPlan`."""
+        model, index = self.model, self.model.index
+        table[spot_fits.MODEL] = index
+        table[spot_fits.START_FLUX] = model.start_flux[index]
+        table[spot_fits.GAIN_X], table[spot_fits.GAIN_Y] = model.gain[index].T
+        narrow = model.fwhm_px.min(axis=1)[index]
+        table[spot_fits.LARGEST_MOVE] = np.maximum(1.0, _LARGEST_MOVE * narrow)
+        table[spot_fits.LEAST_FLUX] = self._least_flux(table[RANGE])
+
+    def fill_flux(self, table: NDArray[np.float32], flux_e: Floats) -> None:
+        """See `EstimatorPlan`."""
+        table[spot_fits.FLUX] = np.nan_to_num(flux_e)
+
+    def _least_flux(self, search_range_px: NDArray[np.float32]) -> Floats:
+        """Return the flux of each sub-aperture below which outliers are expected."""
+        sensor = self.sensor
+        if sensor.psf is None:
+            widths, index = np.unique(sensor.spot_fwhm_px, axis=0, return_inverse=True)
+            spots, index = spot_tables.gaussian_psf(widths), index.reshape(-1)
+        else:
+            spots, index = self.psf, self.psf.index_of(sensor.n)
+        variance = self.variance
+        if sensor.has_noise_map:
+            variance = np.exp(_LEVEL * np.rint(np.log(np.maximum(variance, SMALLEST_VARIANCE)) / _LEVEL))
+        table: Floats = np.column_stack([index, search_range_px, variance])
+        kinds, which = np.unique(table, axis=0, return_inverse=True)
+        side = max(sensor.window)
+        flux = [
+            spot_tables.least_flux(spots, int(plane), float(level), sensor.excess_noise, float(reach), side)
+            for plane, reach, level in kinds
+        ]
+        least: Floats = np.array(flux)[which.reshape(-1)]
+        return least
+
+    @cached_property
+    def psf(self) -> Any:
+        """PSF of the sensor, blurred if the estimator requires it."""
+        psf, blur = self.sensor.psf, float(getattr(self.estimator, "blur_px", 0.0))
+        return psf.blurred(blur) if psf is not None and blur > 0 else psf
+
 
 _WIDTHS = (1.0, 0.6, 0.8, 1.25, 1.6, 2.2)  # multiples of the spot's width
 

@@ -1,1 +1,0 @@
-"""Code shared by all commands: options, messages, progress, output."""

@@ -1,1 +1,0 @@
-"""Functions that process stacks of sub-aperture images."""

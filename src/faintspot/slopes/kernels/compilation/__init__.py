@@ -1,1 +1,0 @@
-"""How kernels are compiled: SIMD types, processor, disk cache, memory order."""

@@ -1,0 +1,233 @@
+"""Flags of spots that are probably wrong: cut by the window edge, or unlike all their neighbours."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from faintspot.base.flags import INVALID, UNMEASURED, SubapertureFlag
+from faintspot.slopes.kernels.compiling import compiled, inlined
+from faintspot.slopes.kernels.dark import flag_dark
+
+_UNMEASURED, _INVALID = int(UNMEASURED), int(INVALID)
+UNLIKE_NEIGHBOURS = int(SubapertureFlag.UNLIKE_NEIGHBOURS)
+AT_SEARCH_LIMIT = int(SubapertureFlag.AT_SEARCH_LIMIT)
+SATURATED = int(SubapertureFlag.SATURATED)
+
+TYPICAL = 4.5
+"""Times the median over the sub-apertures that a spot is off what its neighbours say: by chance, of normally
+distributed displacements, 1 in 1000 of 7 x 7 sub-apertures, 1 in 2000 of 40 x 40."""
+
+SUSPECT, LIKE = 1.5, 2.0
+"""Likewise where the flux shows a second spot or a ghost; and for one that lines of valid ones confirm."""
+_SECOND_SPOT, _GHOST = 1.25, 0.25
+"""Flux over that of the brightest neighbour, from which a window holds a second spot; and over that of the
+dimmest one, up to which it holds the ghost of another spot."""
+_SURELY = 4.0
+"""Photon noise by which the difference from these limits (for a second spot, from no excess) is not zero."""
+
+
+class Expected(NamedTuple):
+    """Expected positions of the spots."""
+
+    zero: Any
+    """(2, n) float32: reference positions x and y, px from the windows' middles."""
+    edge: Any
+    """(2, n) float32: how far from its window's middle a spot is whole, px; infinite where not checked."""
+    lines: Any
+    """(n, m, 2) int64: two sub-apertures in line with each, n where there is none; see `outside`."""
+    outside: Any
+    """(n, m) bool: whether both are on the same side, the nearer one first, rather than opposite."""
+    behind: Any
+    """(n, m, 2) int64: a neighbour of each and the one behind it, n where there is none; m may be 0."""
+    least: Any
+    """Smaller differences from a line never count, px."""
+
+
+@compiled
+def check_slopes(test: Any, frames: Any, slopes: Any, expected: Any, scratch: Any) -> None:
+    """Flag dark sub-apertures and doubtful spots of frames; see `flag_dark` and `flag_doubtful`."""
+    flag_dark(test, frames, slopes, scratch)
+    flag_doubtful(slopes.x, slopes.y, slopes.flux, slopes.flags, expected, scratch)
+
+
+@compiled
+def flag_doubtful(x: Any, y: Any, flux: Any, flags: Any, expected: Any, differences: Any) -> None:
+    """Add AT_SEARCH_LIMIT and UNLIKE_NEIGHBOURS to the flags of measured slopes, each (n_frames, n).
+
+    Displacements that change evenly from one neighbour to the next are alike. `differences` is scratch, at
+    least n numbers of float32.
+    """
+    zero, edge, n = expected.zero, expected.edge, x.shape[1]
+    for f in range(x.shape[0]):
+        for s in range(n):
+            cut = (abs(x[f, s] + zero[0, s]) > edge[0, s]) | (abs(y[f, s] + zero[1, s]) > edge[1, s])
+            unmeasured = (flags[f, s] & np.uint8(_UNMEASURED)) != 0
+            flags[f, s] |= np.uint8(AT_SEARCH_LIMIT) if cut & (not unmeasured) else np.uint8(0)
+        is_suspect = False
+        for s in range(n):
+            if not flags[f, s] & _UNMEASURED and _is_suspect(f, s, x, y, flags, expected):
+                is_suspect = True
+                break
+        if is_suspect:  # seldom, and only then all lines of all spots are needed
+            _compare(f, x, y, flux, flags, expected, differences)
+
+
+@compiled
+def _is_suspect(f: Any, s: Any, x: Any, y: Any, flags: Any, expected: Any) -> Any:
+    """Return whether a slope may differ from each of its lines by more than the difference that counts."""
+    lines, found = expected.lines, False
+    like = np.float32(0.99) * expected.least * expected.least
+    for k in range(lines.shape[1]):
+        a, b = lines[s, k, 0], lines[s, k, 1]
+        if a == x.shape[1]:
+            break
+        if (flags[f, a] | flags[f, b]) & _UNMEASURED:
+            continue
+        if _away(f, s, k, x, y, expected)[0] < like:
+            return False
+        found = True
+    return found
+
+
+@compiled
+def _compare(f: Any, x: Any, y: Any, flux: Any, flags: Any, expected: Any, differences: Any) -> None:
+    """Compare the slopes of a frame with their lines, and flag those unlike all their neighbours."""
+    n, largest, other_flux = x.shape[1], np.float32(0.0), 0
+    for s in range(n):
+        differences[s] = -1.0
+        if flags[f, s] & _UNMEASURED:
+            continue
+        differences[s], least = _difference(f, s, x, y, flags, expected)
+        if least > expected.least:
+            largest = max(largest, differences[s])
+            other_flux += _has_other_flux(f, s, flux, flags, expected)
+    if other_flux > 0 or _exceeds(differences, n, np.float32(1.0 / TYPICAL) * largest):
+        _flag_unlike(f, x, y, flux, flags, expected, differences)
+
+
+@compiled
+def _flag_unlike(f: Any, x: Any, y: Any, flux: Any, flags: Any, expected: Any, differences: Any) -> None:
+    """Add UNLIKE_NEIGHBOURS to the flags of a frame; take it from spots whose neighbours were wrong."""
+    n = x.shape[1]
+    median = _median(differences, n)
+    for s in range(n):
+        if not differences[s] > SUSPECT * median:
+            continue
+        is_far = differences[s] > TYPICAL * median or _has_other_flux(f, s, flux, flags, expected)
+        if is_far and _difference(f, s, x, y, flags, expected)[1] > expected.least:
+            flags[f, s] |= UNLIKE_NEIGHBOURS
+    for s in range(n):
+        if not flags[f, s] & UNLIKE_NEIGHBOURS or _has_other_flux(f, s, flux, flags, expected):
+            continue
+        if _is_continued(f, s, x, y, flags, expected, LIKE * median):
+            differences[s] = -2.0
+    for s in range(n):
+        if differences[s] == -2.0:
+            flags[f, s] &= ~UNLIKE_NEIGHBOURS
+
+
+@compiled
+def _has_other_flux(f: Any, s: Any, flux: Any, flags: Any, expected: Any) -> Any:
+    """Return whether a window has clearly more flux than all its neighbours, or a fraction of it.
+
+    A second spot or a ghost causes that. Windows with saturated pixels never count.
+    """
+    if flags[f, s] & SATURATED:
+        return False
+    lines, n, own = expected.lines, flux.shape[1], flux[f, s]
+    brightest, dimmest = np.float32(0.0), np.float32(math.inf)
+    for k in range(lines.shape[1]):
+        for i in range(2):
+            other = lines[s, k, i]
+            if other < n and not flags[f, other] & _UNMEASURED:
+                brightest, dimmest = max(brightest, flux[f, other]), min(dimmest, flux[f, other])
+                if _GHOST * dimmest <= own <= _SECOND_SPOT * brightest:
+                    return False
+    if not brightest > 0.0:
+        return False
+    if own < _GHOST * dimmest:
+        lack, variance = _GHOST * dimmest - own, _GHOST * _GHOST * dimmest + max(own, 0.0)
+        stands_apart = dimmest - own > brightest - dimmest  # also where read noise makes fluxes differ
+        return stands_apart and lack * lack > _SURELY * _SURELY * variance
+    excess, both = own - brightest, own + brightest
+    return excess * excess > _SURELY * _SURELY * both
+
+
+@compiled
+def _is_continued(f: Any, s: Any, x: Any, y: Any, flags: Any, expected: Any, limit: Any) -> Any:
+    """Return whether a slope continues at least half of the lines of two valid ones beside it."""
+    agree = total = 0
+    for k in range(expected.behind.shape[1]):
+        a, b = expected.behind[s, k, 0], expected.behind[s, k, 1]
+        if b == x.shape[1] or (flags[f, a] | flags[f, b]) & _INVALID:
+            continue
+        away_x, away_y = x[f, s] - 2.0 * x[f, a] + x[f, b], y[f, s] - 2.0 * y[f, a] + y[f, b]
+        away = away_x * away_x + away_y * away_y
+        agree += away <= expected.least * expected.least or away <= 6.0 * limit * limit
+        total += 1
+    return total > 0 and 2 * agree >= total
+
+
+@compiled
+def _exceeds(values: Any, n: Any, limit: Any) -> Any:
+    """Return whether a limit is at least the median of the first n values, without the negative ones."""
+    above = below = 0
+    for s in range(n):
+        above += values[s] > limit
+        below += (values[s] >= 0.0) & (values[s] <= limit)
+    return limit > 0.0 and below >= above
+
+
+@compiled
+def _median(values: Any, n: Any) -> Any:
+    """Return the median of the first n values without the negative ones, to 2^-16 of the largest."""
+    least, most = np.float32(0.0), np.float32(0.0)
+    for s in range(n):
+        most = max(most, values[s])
+    for _ in range(16):
+        middle = np.float32(0.5) * (least + most)
+        above = below = 0
+        for s in range(n):
+            above += values[s] > middle
+            below += (values[s] >= 0.0) & (values[s] <= middle)
+        if above > below:
+            least = middle
+        else:
+            most = middle
+    return most
+
+
+@compiled
+def _difference(f: Any, s: Any, x: Any, y: Any, flags: Any, expected: Any) -> Any:
+    """Return how much a slope differs from the most similar of its lines, for comparison and in px.
+
+    For comparison, it is divided by its error for slopes of error 1; -1 without a line.
+    """
+    lines, n = expected.lines, x.shape[1]
+    square = least = np.float32(math.inf)
+    for k in range(lines.shape[1]):
+        a, b = lines[s, k, 0], lines[s, k, 1]
+        if a == n:
+            break
+        if (flags[f, a] | flags[f, b]) & _UNMEASURED:
+            continue
+        away, variance = _away(f, s, k, x, y, expected)
+        square, least = min(square, away / variance), min(least, away)
+    if square == math.inf:
+        return np.float32(-1.0), np.float32(0.0)
+    return np.float32(math.sqrt(square)), np.float32(math.sqrt(least))
+
+
+@inlined
+def _away(f: Any, s: Any, k: Any, x: Any, y: Any, expected: Any) -> Any:
+    """Return the squared difference of a slope from a line, and its variance for slopes of error 1."""
+    a, b = expected.lines[s, k, 0], expected.lines[s, k, 1]
+    near, far, variance = np.float32(0.5), np.float32(0.5), np.float32(1.5)
+    if expected.outside[s, k]:
+        near, far, variance = np.float32(2.0), np.float32(-1.0), np.float32(6.0)
+    away_x = x[f, s] - near * x[f, a] - far * x[f, b]
+    away_y = y[f, s] - near * y[f, a] - far * y[f, b]
+    return away_x * away_x + away_y * away_y, variance

@@ -1,1 +1,0 @@
-"""Background subtraction and centre of gravity."""

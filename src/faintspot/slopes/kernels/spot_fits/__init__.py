@@ -1,1 +1,0 @@
-"""Fits of a spot model: likelihood, posterior, weights."""

@@ -1,1 +1,0 @@
-"""Total-variation denoising of groups of sub-apertures."""
