@@ -17,25 +17,11 @@ from numpy.typing import NDArray
 from faintspot.base.errors import InputError
 from faintspot.engine.path.workers import SlopePrior, Workers
 from faintspot.loop.control.configuration import prior_std_px
+from faintspot.slopes.kernels import streaming
 from faintspot.slopes.kernels.compiling import Direct
 from faintspot.slopes.kernels.groups import DENOISED, ERROR_SCALE, STAGE_ROWS, SlopeArrays, new_scratch
 from faintspot.slopes.kernels.host import WIDTHS, lanes_for
 from faintspot.slopes.kernels.products import NO_PRODUCT, ProductPart
-from faintspot.slopes.kernels.streaming import (
-    COLD,
-    LAST_ROW,
-    MARGIN,
-    PACE_CELLS,
-    PENDING,
-    SHORTEST_NS,
-    SLEEPS,
-    WOKEN_LATE,
-    Arrival,
-    multiply_until,
-    sleep_until_due,
-    streamed,
-    wait_for_group,
-)
 from faintspot.slopes.pipeline.slope_pipeline import SlopePipeline
 from faintspot.slopes.pipeline.slopes import RESULT_TYPES, Slopes
 
@@ -91,9 +77,9 @@ class _Groups:
         """Settings of every sub-aperture for the kernel: rows as in `kernels.groups`."""
         self._work = [(pipeline.source(slot[None], slot.dtype), task) for slot in slots]
         self._width, self._frame_rows = pipeline.width, int(last_rows_of_groups(pipeline, 1).max())
-        self._kernel = Direct(streamed(pipeline.plan.prepared.kernel))
-        self._multiply = Direct(multiply_until)
-        self._sleep = Direct(sleep_until_due)
+        self._kernel = Direct(streaming.streamed(pipeline.plan.prepared.kernel))
+        self._multiply = Direct(streaming.multiply_until)
+        self._sleep = Direct(streaming.sleep_until_due)
         lanes, window = lanes_for(np.float32, pipeline.width), pipeline.layout.window
         own_scratch = pipeline.plan.own_scratch
         self._due = np.zeros(len(self._last_rows), np.int64)
@@ -118,9 +104,9 @@ class _Groups:
         start, last, stop = self._ranges[share]
         control, pace = waiting
         cells = progress.cells, progress.frame_cell, progress.rows_cell
-        arrival = Arrival(*cells, control, STOP_CELL, pace, self._due)
+        arrival = streaming.Arrival(*cells, control, STOP_CELL, pace, self._due)
         arguments = self._scratch[share], *after, part
-        pace[PENDING] = start
+        pace[streaming.PENDING] = start
         if rehearse is not None:
             for group in sorted({start, last}):
                 if self._kernel(arrival, number, self._last_rows, *work, start, group, *arguments) < group:
@@ -134,7 +120,7 @@ class _Groups:
                     # A frame that has passed is not waited for: only code and data come into the cache again.
                     self._kernel(arrival, -1, self._last_rows, *work, last, last + 1, *arguments)
                     rehearse()
-                    pace[COLD] = 0
+                    pace[streaming.COLD] = 0
         done: int = self._kernel(arrival, number, self._last_rows, *work, start, stop, *arguments)
         self._multiply(arrival, number, self._frame_rows, done, self._width, after[0], part)
         return done == stop
@@ -190,10 +176,10 @@ class FramePath:
         self.failed = False
         """Whether the estimator failed in the last frame."""
         self._control = np.zeros(1, np.int64)
-        self._pace = np.zeros((self._shares, PACE_CELLS), np.int64)
-        self._pace[:, MARGIN] = SHORTEST_NS
+        self._pace = np.zeros((self._shares, streaming.PACE_CELLS), np.int64)
+        self._pace[:, streaming.MARGIN] = streaming.SHORTEST_NS
         self._start_due = np.zeros(1, np.int64)
-        self._wait_for_group = Direct(wait_for_group)
+        self._wait_for_group = Direct(streaming.wait_for_group)
         wide, rest = pipeline.width, n % pipeline.width
         full = n // wide
         # The remainder is measured in a narrower group if that is faster; it has the last rows.
@@ -227,12 +213,12 @@ class FramePath:
     @property
     def woken_late(self) -> int:
         """Number of times that a thread has woken up after its rows were there."""
-        return int(self._pace[:, WOKEN_LATE].sum())
+        return int(self._pace[:, streaming.WOKEN_LATE].sum())
 
     @property
     def sleeps(self) -> int:
         """Number of times that the caller's thread has slept until rows were due."""
-        return int(self._pace[0, SLEEPS])
+        return int(self._pace[0, streaming.SLEEPS])
 
     def warm_up(self) -> None:
         """Measure the present content of the first slot, to compile everything and fill the caches."""
@@ -279,7 +265,7 @@ class FramePath:
         """
         for part in product:
             part.taken[:] = part.out[:] = 0.0
-        self._pace[:, LAST_ROW] = after_ns
+        self._pace[:, streaming.LAST_ROW] = after_ns
         if self._prior is not None and self._prior.changes != self._prior_changes:
             self._widen(self._prior)
         self._slot = number % len(self._frames) if slot is None else slot
@@ -319,7 +305,7 @@ class FramePath:
 
     def await_start(self, number: int, after_ns: int = 0) -> None:
         """Wait for the first row of a frame, or until `stop` is called; `after_ns` as for `measure`."""
-        self._pace[0, LAST_ROW] = after_ns
+        self._pace[0, streaming.LAST_ROW] = after_ns
         self._await_row(self._progress, number)
 
     def stop(self) -> None:
@@ -333,7 +319,7 @@ class FramePath:
     def _await_row(self, progress: Progress, number: int) -> None:
         """Wait for the first row of a frame."""
         cells = progress.cells, progress.frame_cell, progress.rows_cell
-        arrival = Arrival(*cells, self._control, STOP_CELL, self._pace[0], self._start_due)
+        arrival = streaming.Arrival(*cells, self._control, STOP_CELL, self._pace[0], self._start_due)
         self._wait_for_group(arrival, number, 1, 0)
 
     def _work(

@@ -16,26 +16,7 @@ from numpy.typing import DTypeLike, NDArray
 
 from faintspot.base.errors import InputError
 from faintspot.engine.pixels.segment import identity_of, new_memory, process_start
-from faintspot.engine.streams.image_layout import (
-    COUNTER,
-    ISIO,
-    KEYWORD,
-    MATH_DATA,
-    METADATA,
-    MOST_POSTED,
-    SEMAPHORE_BYTES,
-    SEMAPHORES,
-    TRACES,
-    TYPES,
-    VERSION,
-    WRITING,
-    IncompatibleStreamError,
-    Places,
-    Semaphore,
-    checked,
-    path_of,
-    places_of,
-)
+from faintspot.engine.streams import image_layout as layout
 from faintspot.slopes.kernels.ordered import fence, load, store
 
 LARGEST_NUMBER = 2**63 - 1
@@ -59,13 +40,13 @@ _OPEN = os.O_NONBLOCK | os.O_CLOEXEC  # never block on a named pipe
 class _Mapped:
     """A memory-mapped stream, with its parts as arrays."""
 
-    def __init__(self, memory: mmap.mmap, places: Places, shape: tuple[int, ...]) -> None:
-        self.fields = np.ndarray((), METADATA, memory)
+    def __init__(self, memory: mmap.mmap, places: layout.Places, shape: tuple[int, ...]) -> None:
+        self.fields = np.ndarray((), layout.METADATA, memory)
         """Metadata as arrays, which change when other processes write."""
         self.memory, self.places = memory, places
-        self.counter = np.ndarray((1,), np.int64, memory, COUNTER)
-        self.writing = np.ndarray((), np.uint8, memory, WRITING)
-        dtype = np.dtype(TYPES[int(self.fields["datatype"])])
+        self.counter = np.ndarray((1,), np.int64, memory, layout.COUNTER)
+        self.writing = np.ndarray((), np.uint8, memory, layout.WRITING)
+        dtype = np.dtype(layout.TYPES[int(self.fields["datatype"])])
         self.values: NDArray[Any] = np.ndarray(shape, dtype, memory, places.values)
         self.address = np.frombuffer(memory, np.uint8).ctypes.data
 
@@ -75,7 +56,7 @@ class _Mapped:
 
     def semaphore(self, number: int) -> int:
         """Return the address of a semaphore in memory."""
-        return self.address + self.places.semaphores + SEMAPHORE_BYTES * number
+        return self.address + self.places.semaphores + layout.SEMAPHORE_BYTES * number
 
 
 class ImageStream:
@@ -99,7 +80,7 @@ class ImageStream:
     """
 
     def __init__(self, name: str) -> None:
-        self._path = path_of(name)
+        self._path = layout.path_of(name)
         try:
             descriptor = os.open(self._path, os.O_RDWR | _OPEN)
             writable = True
@@ -108,7 +89,7 @@ class ImageStream:
         try:
             status = os.fstat(descriptor)
             size, metadata = status.st_size, _metadata_of(descriptor, status)
-            places, self.shape, self.dtype, self._circular = checked(metadata, size)
+            places, self.shape, self.dtype, self._circular = layout.checked(metadata, size)
             access = mmap.ACCESS_WRITE if writable else mmap.ACCESS_READ
             memory = mmap.mmap(descriptor, size, access=access)
         except BaseException:
@@ -160,7 +141,7 @@ class ImageStream:
             if self._turn is None:
                 time.sleep(_NAP_S)
             else:
-                Semaphore(self._mapped.semaphore(self._turn)).wait(_NAP_S)
+                layout.Semaphore(self._mapped.semaphore(self._turn)).wait(_NAP_S)
         return True
 
     def read(self, out: NDArray[np.generic] | None = None, limit_s: float = 0.0) -> Publication | None:
@@ -220,16 +201,19 @@ class ImageStreamWriter:
     """
 
     def __init__(self, name: str, shape: tuple[int, ...], dtype: DTypeLike = np.float32) -> None:
-        self.path = path_of(name)
+        self.path = layout.path_of(name)
         self.shape = (1, *shape) if len(shape) == 1 else shape
         head = self._head(np.dtype(dtype))
         _check_free(self.path)
-        self._mapped = self._made(head, places_of(head))
+        self._mapped = self._made(head, layout.places_of(head))
         self._identity = identity_of(self.path.stat())
-        self._keyword: Any = np.ndarray((), KEYWORD, self._mapped.memory, self._mapped.places.keywords)
+        self._keyword: Any = np.ndarray((), layout.KEYWORD, self._mapped.memory, self._mapped.places.keywords)
         self._keyword["name"], self._keyword["type"] = b"FRAME", b"L"
-        log = Semaphore(self._mapped.address + self._mapped.places.log_semaphore)
-        self._semaphores = [*(Semaphore(self._mapped.semaphore(each)) for each in range(SEMAPHORES)), log]
+        log = layout.Semaphore(self._mapped.address + self._mapped.places.log_semaphore)
+        self._semaphores = [
+            *(layout.Semaphore(self._mapped.semaphore(each)) for each in range(layout.SEMAPHORES)),
+            log,
+        ]
 
     def publish(self, values: NDArray[np.generic], number: int) -> None:
         """Publish the values of a frame."""
@@ -244,7 +228,7 @@ class ImageStreamWriter:
         fence()
         mapped.writing[...] = 0
         for semaphore in self._semaphores:
-            semaphore.post(MOST_POSTED)
+            semaphore.post(layout.MOST_POSTED)
 
     def close(self) -> None:
         """Remove the stream, unless another process has replaced it."""
@@ -252,16 +236,16 @@ class ImageStreamWriter:
             if identity_of(self.path.stat()) == self._identity:
                 self.path.unlink()
 
-    def _made(self, head: NDArray[Any], places: Places) -> _Mapped:
+    def _made(self, head: NDArray[Any], places: layout.Places) -> _Mapped:
         """Make the stream's file."""
         try:
             with new_memory(self.path, places.total, 0o666) as (memory, hidden):
                 head["inode"] = hidden.stat().st_ino
                 memory[: head.nbytes] = head.tobytes()
                 mapped = _Mapped(memory, places, self.shape)
-                for number in range(SEMAPHORES):
-                    Semaphore.make(mapped.semaphore(number))
-                Semaphore.make(mapped.address + places.log_semaphore)
+                for number in range(layout.SEMAPHORES):
+                    layout.Semaphore.make(mapped.semaphore(number))
+                layout.Semaphore.make(mapped.address + places.log_semaphore)
                 mapped.pids(places.readers)[:] = -1
                 mapped.pids(places.writers)[:] = os.getpid()
                 os.replace(hidden, self.path)
@@ -273,14 +257,14 @@ class ImageStreamWriter:
 
     def _head(self, dtype: np.dtype[np.generic]) -> NDArray[np.generic]:
         """Return the metadata of a new stream."""
-        head = np.zeros((), METADATA)
-        code = next(code for code, each in TYPES.items() if np.dtype(each) == dtype)
+        head = np.zeros((), layout.METADATA)
+        code = next(code for code, each in layout.TYPES.items() if np.dtype(each) == dtype)
         head["naxis"], head["size"] = 2, (*self.shape[::-1], 0)
         head["nelement"], head["datatype"] = math.prod(self.shape), code
-        head["shared"], head["sem"], head["NBkw"] = 1, SEMAPHORES, 1
+        head["shared"], head["sem"], head["NBkw"] = 1, layout.SEMAPHORES, 1
         head["name"] = self.path.name.removesuffix(".im.shm").encode()
-        head["version"], head["imagetype"], head["location"] = VERSION, MATH_DATA, -1
-        head["NBproctrace"], head["creatorPID"] = TRACES, os.getpid()
+        head["version"], head["imagetype"], head["location"] = layout.VERSION, layout.MATH_DATA, -1
+        head["NBproctrace"], head["creatorPID"] = layout.TRACES, os.getpid()
         head["imdatamemsize"] = math.prod(self.shape) * dtype.itemsize
         head["creationtime"] = head["lastaccesstime"] = _clock()
         return head
@@ -304,27 +288,28 @@ def _check_free(path: Path) -> None:
     except FileNotFoundError:
         return
     except OSError as error:
-        raise InputError(f"{ISIO}:{path}: cannot be opened ({error.strerror})") from None
+        raise InputError(f"{layout.ISIO}:{path}: cannot be opened ({error.strerror})") from None
     try:
         status = os.fstat(descriptor)
         head = _metadata_of(descriptor, status)
-        checked(head, status.st_size)
-    except IncompatibleStreamError as error:
-        raise InputError(f"{ISIO}:{path}: {error}; remove it or choose another name") from None
+        layout.checked(head, status.st_size)
+    except layout.IncompatibleStreamError as error:
+        raise InputError(f"{layout.ISIO}:{path}: {error}; remove it or choose another name") from None
     finally:
         os.close(descriptor)
     maker = int(head["creatorPID"])
     if maker not in (0, os.getpid()) and process_start(maker) >= 0:
         raise InputError(
-            f"{ISIO}:{path}: a living process made this stream (pid {maker}); stop it or choose another name"
+            f"{layout.ISIO}:{path}: a living process made this stream (pid {maker}); stop it "
+            "or choose another name"
         )
 
 
 def _metadata_of(descriptor: int, status: os.stat_result) -> Any:
     """Return the metadata of an open file; refuse what can have none."""
-    if not stat.S_ISREG(status.st_mode) or status.st_size <= METADATA.itemsize:
-        raise IncompatibleStreamError("is not a stream")
-    return np.frombuffer(os.pread(descriptor, METADATA.itemsize, 0), METADATA)[0]
+    if not stat.S_ISREG(status.st_mode) or status.st_size <= layout.METADATA.itemsize:
+        raise layout.IncompatibleStreamError("is not a stream")
+    return np.frombuffer(os.pread(descriptor, layout.METADATA.itemsize, 0), layout.METADATA)[0]
 
 
 def _clock() -> tuple[int, int]:

@@ -15,20 +15,7 @@ from faintspot.base.errors import InputError, errors_within
 from faintspot.base.files import check_size
 from faintspot.base.tables import ConfigurationTable, tables_as_text
 from faintspot.base.text_files import check_keys, check_known, checked_table, parse_file, parse_text
-from faintspot.loop.simulation.sections import (
-    CLOSED,
-    OPEN,
-    Atmosphere,
-    Camera,
-    ControlParameters,
-    Laser,
-    Mirror,
-    NaturalStar,
-    RunLength,
-    Science,
-    SensorParameters,
-    Telescope,
-)
+from faintspot.loop.simulation import sections
 from faintspot.loop.slope_covariance import ARCSEC
 from faintspot.slopes.estimators.sensor import Scene
 from faintspot.slopes.simulate.photometry import Photometry
@@ -39,7 +26,7 @@ from faintspot.slopes.spots.von_karman import R0_WAVELENGTH_M
 SPOT_FWHM = 0.886  # full width at half maximum of sinc^2, in lambda / d
 _MOST_POINTS = 4096**2  # of a wavefront
 _POINT_FIELD = 0.9  # of a window that holds a laser guide star
-_POSITION_RANGE_PX = {CLOSED: 2.0, OPEN: 5.0}
+_POSITION_RANGE_PX = {sections.CLOSED: 2.0, sections.OPEN: 5.0}
 
 
 @dataclass(frozen=True)
@@ -62,16 +49,16 @@ class LoopConfiguration:
     """
 
     name: str = "canary"
-    telescope: Telescope = field(default_factory=Telescope)
-    sensor: SensorParameters = field(default_factory=SensorParameters)
-    mirror: Mirror = field(default_factory=Mirror)
-    atmosphere: Atmosphere = field(default_factory=Atmosphere)
-    camera: Camera = field(default_factory=lambda: Camera(photons_per_subaperture=100.0))
-    control: ControlParameters = field(default_factory=ControlParameters)
-    science: Science = field(default_factory=Science)
-    run: RunLength = field(default_factory=RunLength)
-    laser: Laser | None = None
-    natural_star: NaturalStar | None = None
+    telescope: sections.Telescope = field(default_factory=sections.Telescope)
+    sensor: sections.SensorParameters = field(default_factory=sections.SensorParameters)
+    mirror: sections.Mirror = field(default_factory=sections.Mirror)
+    atmosphere: sections.Atmosphere = field(default_factory=sections.Atmosphere)
+    camera: sections.Camera = field(default_factory=lambda: sections.Camera(photons_per_subaperture=100.0))
+    control: sections.ControlParameters = field(default_factory=sections.ControlParameters)
+    science: sections.Science = field(default_factory=sections.Science)
+    run: sections.RunLength = field(default_factory=sections.RunLength)
+    laser: sections.Laser | None = None
+    natural_star: sections.NaturalStar | None = None
 
     def __post_init__(self) -> None:
         if not isinstance(self.name, str) or not self.name:
@@ -143,7 +130,7 @@ class LoopConfiguration:
 
     def position_range_px(self, *, predicted: bool = False) -> float:
         """Return the largest distance of spots from the reference, or from the predicted position."""
-        return _POSITION_RANGE_PX[CLOSED if predicted else self.control.mode]
+        return _POSITION_RANGE_PX[sections.CLOSED if predicted else self.control.mode]
 
     @property
     def scene(self) -> Scene:
@@ -225,16 +212,16 @@ class LoopConfiguration:
 
 
 SECTIONS: dict[str, type[ConfigurationTable]] = {
-    "telescope": Telescope,
-    "sensor": SensorParameters,
-    "mirror": Mirror,
-    "atmosphere": Atmosphere,
-    "camera": Camera,
-    "control": ControlParameters,
-    "science": Science,
-    "run": RunLength,
-    "laser": Laser,
-    "natural_star": NaturalStar,
+    "telescope": sections.Telescope,
+    "sensor": sections.SensorParameters,
+    "mirror": sections.Mirror,
+    "atmosphere": sections.Atmosphere,
+    "camera": sections.Camera,
+    "control": sections.ControlParameters,
+    "science": sections.Science,
+    "run": sections.RunLength,
+    "laser": sections.Laser,
+    "natural_star": sections.NaturalStar,
 }
 _OPTIONAL = ("laser", "natural_star")
 
@@ -283,7 +270,7 @@ def _shipped() -> Any:
     return resources.files("faintspot.loop.simulation") / "presets"
 
 
-def _check_layers(atmosphere: Atmosphere) -> None:
+def _check_layers(atmosphere: sections.Atmosphere) -> None:
     names = ("altitude_m", "fraction", "wind_speed_m_per_s", "wind_direction_deg")
     lengths = {name: len(getattr(atmosphere, name)) for name in names}
     if len(set(lengths.values())) > 1 or not atmosphere.fraction:
@@ -299,7 +286,7 @@ def _check_layers(atmosphere: Atmosphere) -> None:
         )
 
 
-def _check_flux(camera: Camera) -> None:
+def _check_flux(camera: sections.Camera) -> None:
     if (camera.photons_per_subaperture is None) == (camera.magnitude is None):
         raise InputError("camera: expected either photons_per_subaperture or magnitude")
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
+from faintspot.slopes.kernels import spot_rows as row
 from faintspot.slopes.kernels.compiling import compiled
 from faintspot.slopes.kernels.simd import (
     absolute,
@@ -24,46 +25,7 @@ from faintspot.slopes.kernels.simd import (
     store_all,
     width_of,
 )
-from faintspot.slopes.kernels.spot_rows import (
-    COVARIANCE,
-    ERROR_X,
-    ERROR_Y,
-    FLUX,
-    HIGH_X,
-    HIGH_Y,
-    I_FF,
-    I_XF,
-    I_XX,
-    I_XY,
-    I_YF,
-    I_YY,
-    J_FF,
-    J_XF,
-    J_XX,
-    J_XY,
-    J_YF,
-    J_YY,
-    LARGEST_MOVE,
-    LOW_X,
-    LOW_Y,
-    MOVE,
-    MOVE_BEFORE,
-    PRIOR_WEIGHT,
-    PRIOR_X,
-    PRIOR_Y,
-    SCORE_F,
-    SCORE_X,
-    SCORE_Y,
-    SEEN,
-    SEEN_ERROR,
-    X,
-    Y,
-    eliminate_background,
-    look_up,
-    model_at,
-    noise_of,
-    weigh,
-)
+from faintspot.slopes.kernels.spot_rows import eliminate_background, look_up, model_at, noise_of, weigh
 
 LARGEST_FACTOR = 2.0  # on the flux, in one step
 LEAST_FLUX_E = 1e-2
@@ -77,7 +39,7 @@ def _separable_sums(
     width = width_of(lanes)
     padded = profiles.shape[3]
     zero = splat(lanes, 0.0)
-    noise, flux = noise_of(lanes, lane_values), load(lanes, lane_values, FLUX * width)
+    noise, flux = noise_of(lanes, lane_values), load(lanes, lane_values, row.FLUX * width)
     sx, sy, sf = zero, zero, zero
     ixx, iyy, iff, ixy, ixf, iyf = zero, zero, zero, zero, zero, zero
     jxx, jyy, jff, jxy, jxf, jyf = zero, zero, zero, zero, zero, zero
@@ -103,7 +65,7 @@ def _separable_sums(
         jxx, jyy, jff = multiply_add(j2, ff, jxx), multiply_add(j0, dd, jyy), multiply_add(j0, ff, jff)
         jxy, jxf, jyf = multiply_add(j1, fd, jxy), multiply_add(j1, ff, jxf), multiply_add(j0, fd, jyf)
     sums = sx, sy, sf, ixx, iyy, iff, ixy, ixf, iyf, jxx, jyy, jff, jxy, jxf, jyf
-    store_all(lane_values, SCORE_X * width, sums)
+    store_all(lane_values, row.SCORE_X * width, sums)
 
 
 @compiled
@@ -113,7 +75,7 @@ def _general_sums(
     """Sum as `_separable_sums`, for a PSF of several separable terms."""
     width = width_of(lanes)
     zero = splat(lanes, 0.0)
-    noise, flux = noise_of(lanes, lane_values), load(lanes, lane_values, FLUX * width)
+    noise, flux = noise_of(lanes, lane_values), load(lanes, lane_values, row.FLUX * width)
     sx, sy, sf = zero, zero, zero
     ixx, iyy, iff, ixy, ixf, iyf = zero, zero, zero, zero, zero, zero
     jxx, jyy, jff, jxy, jxf, jyf = zero, zero, zero, zero, zero, zero
@@ -132,7 +94,7 @@ def _general_sums(
             jxx, jyy, jff = multiply_add(wx, mx, jxx), multiply_add(wy, my, jyy), multiply_add(wm, m, jff)
             jxy, jxf, jyf = multiply_add(wx, my, jxy), multiply_add(wx, m, jxf), multiply_add(wy, m, jyf)
     sums = sx, sy, sf, ixx, iyy, iff, ixy, ixf, iyf, jxx, jyy, jff, jxy, jxf, jyf
-    store_all(lane_values, SCORE_X * width, sums)
+    store_all(lane_values, row.SCORE_X * width, sums)
 
 
 @compiled
@@ -141,26 +103,26 @@ def _move(lanes: Any, lane_values: Any) -> None:
     width = width_of(lanes)
     zero, one, tiny = splat(lanes, 0.0), splat(lanes, 1.0), splat(lanes, 1e-20)
     x, y, flux = (
-        load(lanes, lane_values, X * width),
-        load(lanes, lane_values, Y * width),
-        load(lanes, lane_values, FLUX * width),
+        load(lanes, lane_values, row.X * width),
+        load(lanes, lane_values, row.Y * width),
+        load(lanes, lane_values, row.FLUX * width),
     )
-    prior = load(lanes, lane_values, PRIOR_WEIGHT * width)
+    prior = load(lanes, lane_values, row.PRIOR_WEIGHT * width)
     sf, ixf, iyf = (
-        load(lanes, lane_values, SCORE_F * width),
-        load(lanes, lane_values, I_XF * width),
-        load(lanes, lane_values, I_YF * width),
+        load(lanes, lane_values, row.SCORE_F * width),
+        load(lanes, lane_values, row.I_XF * width),
+        load(lanes, lane_values, row.I_YF * width),
     )
     # The flux is eliminated first, then y; a lane without information does not move.
-    inverse_ff = one / maximum(load(lanes, lane_values, I_FF * width), tiny)
+    inverse_ff = one / maximum(load(lanes, lane_values, row.I_FF * width), tiny)
     cx, cy = ixf * inverse_ff, iyf * inverse_ff
-    bx = load(lanes, lane_values, SCORE_X * width) - cx * sf
-    by = load(lanes, lane_values, SCORE_Y * width) - cy * sf
-    bx = multiply_add(prior, load(lanes, lane_values, PRIOR_X * width) - x, bx)
-    by = multiply_add(prior, load(lanes, lane_values, PRIOR_Y * width) - y, by)
-    axx = load(lanes, lane_values, I_XX * width) - cx * ixf + prior
-    ayy = load(lanes, lane_values, I_YY * width) - cy * iyf + prior
-    axy = load(lanes, lane_values, I_XY * width) - cx * iyf
+    bx = load(lanes, lane_values, row.SCORE_X * width) - cx * sf
+    by = load(lanes, lane_values, row.SCORE_Y * width) - cy * sf
+    bx = multiply_add(prior, load(lanes, lane_values, row.PRIOR_X * width) - x, bx)
+    by = multiply_add(prior, load(lanes, lane_values, row.PRIOR_Y * width) - y, by)
+    axx = load(lanes, lane_values, row.I_XX * width) - cx * ixf + prior
+    ayy = load(lanes, lane_values, row.I_YY * width) - cy * iyf + prior
+    axy = load(lanes, lane_values, row.I_XY * width) - cx * iyf
     slope = axy / maximum(ayy, tiny)
     left = axx - slope * axy
     # An almost singular matrix (round-off) gives no direction to go in.
@@ -169,14 +131,14 @@ def _move(lanes: Any, lane_values: Any) -> None:
     dy = select(sound, (by - axy * dx) / maximum(ayy, tiny), zero)
     # A step is too long by how much more flux there is than the model has: linear is only their product.
     growth = maximum((sf - ixf * dx - iyf * dy) * inverse_ff, one)
-    most = load(lanes, lane_values, LARGEST_MOVE * width)
+    most = load(lanes, lane_values, row.LARGEST_MOVE * width)
     least = zero - most
     dx, dy = minimum(maximum(dx / growth, least), most), minimum(maximum(dy / growth, least), most)
-    store(lane_values, MOVE_BEFORE * width, load(lanes, lane_values, MOVE * width))
-    store(lane_values, MOVE * width, maximum(absolute(dx), absolute(dy)))
+    store(lane_values, row.MOVE_BEFORE * width, load(lanes, lane_values, row.MOVE * width))
+    store(lane_values, row.MOVE * width, maximum(absolute(dx), absolute(dy)))
     # Where a bound stops one axis, the other one goes to the best position on the bound.
-    low_x, high_x = load(lanes, lane_values, LOW_X * width), load(lanes, lane_values, HIGH_X * width)
-    low_y, high_y = load(lanes, lane_values, LOW_Y * width), load(lanes, lane_values, HIGH_Y * width)
+    low_x, high_x = load(lanes, lane_values, row.LOW_X * width), load(lanes, lane_values, row.HIGH_X * width)
+    low_y, high_y = load(lanes, lane_values, row.LOW_Y * width), load(lanes, lane_values, row.HIGH_Y * width)
     left_x, right_x, left_y, right_y = low_x - x, high_x - x, low_y - y, high_y - y
     free_x = minimum(dx - left_x, right_x - dx) >= zero
     dx = select(free_x, dx, minimum(maximum(dx, left_x), right_x))
@@ -190,9 +152,9 @@ def _move(lanes: Any, lane_values: Any) -> None:
     df = (sf - ixf * dx - iyf * dy) * inverse_ff
     factor = minimum(maximum(one + df, splat(lanes, 1.0 / LARGEST_FACTOR)), splat(lanes, LARGEST_FACTOR))
     x, y = minimum(maximum(x + dx, low_x), high_x), minimum(maximum(y + dy, low_y), high_y)
-    store(lane_values, X * width, x)
-    store(lane_values, Y * width, y)
-    store(lane_values, FLUX * width, maximum(flux * factor, splat(lanes, LEAST_FLUX_E)))
+    store(lane_values, row.X * width, x)
+    store(lane_values, row.Y * width, y)
+    store(lane_values, row.FLUX * width, maximum(flux * factor, splat(lanes, LEAST_FLUX_E)))
 
 
 @compiled
@@ -201,41 +163,41 @@ def _store_errors(width: Any, lane: Any, flux: Any, lane_values: Any) -> None:
 
     The covariance of x and y is A^-1 (J + prior) A^-1, A = I + prior.
     """
-    prior = float(lane_values[PRIOR_WEIGHT * width + lane])
-    iff = float(lane_values[I_FF * width + lane])
-    lane_values[ERROR_X * width + lane] = math.inf
-    lane_values[ERROR_Y * width + lane] = math.inf
-    lane_values[COVARIANCE * width + lane] = 0.0
-    lane_values[SEEN * width + lane] = 0.0
-    lane_values[SEEN_ERROR * width + lane] = math.inf
+    prior = float(lane_values[row.PRIOR_WEIGHT * width + lane])
+    iff = float(lane_values[row.I_FF * width + lane])
+    lane_values[row.ERROR_X * width + lane] = math.inf
+    lane_values[row.ERROR_Y * width + lane] = math.inf
+    lane_values[row.COVARIANCE * width + lane] = 0.0
+    lane_values[row.SEEN * width + lane] = 0.0
+    lane_values[row.SEEN_ERROR * width + lane] = math.inf
     if not iff > 0.0:
         return
     # The model is proportional to the flux: sum w g m / sum w m^2 is the flux that fits best.
-    lane_values[SEEN * width + lane] = flux * (1.0 + lane_values[SCORE_F * width + lane] / iff)
-    lane_values[SEEN_ERROR * width + lane] = flux / math.sqrt(iff)
-    cx, cy = lane_values[I_XF * width + lane] / iff, lane_values[I_YF * width + lane] / iff
-    axx = lane_values[I_XX * width + lane] - cx * lane_values[I_XF * width + lane] + prior
-    ayy = lane_values[I_YY * width + lane] - cy * lane_values[I_YF * width + lane] + prior
-    axy = lane_values[I_XY * width + lane] - cx * lane_values[I_YF * width + lane]
+    lane_values[row.SEEN * width + lane] = flux * (1.0 + lane_values[row.SCORE_F * width + lane] / iff)
+    lane_values[row.SEEN_ERROR * width + lane] = flux / math.sqrt(iff)
+    cx, cy = lane_values[row.I_XF * width + lane] / iff, lane_values[row.I_YF * width + lane] / iff
+    axx = lane_values[row.I_XX * width + lane] - cx * lane_values[row.I_XF * width + lane] + prior
+    ayy = lane_values[row.I_YY * width + lane] - cy * lane_values[row.I_YF * width + lane] + prior
+    axy = lane_values[row.I_XY * width + lane] - cx * lane_values[row.I_YF * width + lane]
     determinant = axx * ayy - axy * axy
     if not determinant > 1e-5 * axx * ayy:
         return
     # With the flux eliminated, the score is s - c s_F; so its covariance is
     jxf, jyf, jff = (
-        lane_values[J_XF * width + lane],
-        lane_values[J_YF * width + lane],
-        lane_values[J_FF * width + lane],
+        lane_values[row.J_XF * width + lane],
+        lane_values[row.J_YF * width + lane],
+        lane_values[row.J_FF * width + lane],
     )
-    bxx = lane_values[J_XX * width + lane] - 2.0 * cx * jxf + cx * cx * jff + prior
-    byy = lane_values[J_YY * width + lane] - 2.0 * cy * jyf + cy * cy * jff + prior
-    bxy = lane_values[J_XY * width + lane] - cy * jxf - cx * jyf + cx * cy * jff
+    bxx = lane_values[row.J_XX * width + lane] - 2.0 * cx * jxf + cx * cx * jff + prior
+    byy = lane_values[row.J_YY * width + lane] - 2.0 * cy * jyf + cy * cy * jff + prior
+    bxy = lane_values[row.J_XY * width + lane] - cy * jxf - cx * jyf + cx * cy * jff
     vx = (ayy * ayy * bxx - 2.0 * ayy * axy * bxy + axy * axy * byy) / (determinant * determinant)
     vy = (axx * axx * byy - 2.0 * axx * axy * bxy + axy * axy * bxx) / (determinant * determinant)
     if vx > 0.0 and vy > 0.0:
-        lane_values[ERROR_X * width + lane] = math.sqrt(vx)
-        lane_values[ERROR_Y * width + lane] = math.sqrt(vy)
+        lane_values[row.ERROR_X * width + lane] = math.sqrt(vx)
+        lane_values[row.ERROR_Y * width + lane] = math.sqrt(vy)
         vxy = (axx * ayy + axy * axy) * bxy - axy * (ayy * bxx + axx * byy)
-        lane_values[COVARIANCE * width + lane] = vxy / (determinant * determinant)
+        lane_values[row.COVARIANCE * width + lane] = vxy / (determinant * determinant)
 
 
 @compiled
@@ -282,5 +244,5 @@ def fit_group(
             eliminate_background(lanes, image, variances, place, ny, nx, profiles, lane_values)
         if step == steps - 1:
             for lane in range(width):
-                _store_errors(width, lane, float(lane_values[FLUX * width + lane]), lane_values)
+                _store_errors(width, lane, float(lane_values[row.FLUX * width + lane]), lane_values)
         _move(lanes, lane_values)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
+from faintspot.slopes.kernels import spot_rows as row
 from faintspot.slopes.kernels.compiling import compiled
 from faintspot.slopes.kernels.simd import (
     absolute,
@@ -20,37 +21,7 @@ from faintspot.slopes.kernels.simd import (
     width_of,
 )
 from faintspot.slopes.kernels.smoothing import SMALLEST_VARIANCE, relative_variance, variance_of
-from faintspot.slopes.kernels.spot_rows import (
-    COVARIANCE,
-    ERROR_X,
-    ERROR_Y,
-    EXCESS,
-    FLUX,
-    GAIN_X,
-    GAIN_Y,
-    HIGH_X,
-    HIGH_Y,
-    LARGEST_MOVE,
-    LOW_X,
-    LOW_Y,
-    MEAN_X,
-    MEAN_Y,
-    MOVE,
-    MOVE_BEFORE,
-    PRIOR_WEIGHT,
-    PRIOR_X,
-    PRIOR_Y,
-    SEEN,
-    SEEN_ERROR,
-    SPACING,
-    SPREAD_X,
-    SPREAD_XY,
-    SPREAD_Y,
-    VARIANCE,
-    X,
-    Y,
-    look_up,
-)
+from faintspot.slopes.kernels.spot_rows import look_up
 
 LEAST_FRACTION = 0.05  # of the flux at the start: less under the weight would only amplify noise
 
@@ -61,31 +32,31 @@ def _move(lanes: Any, image: Any, ny: Any, nx: Any, profiles: Any, floor: Any, l
     width = width_of(lanes)
     padded = profiles.shape[3]
     zero = splat(lanes, 0.0)
-    x0, y0 = load(lanes, lane_values, X * width), load(lanes, lane_values, Y * width)
+    x0, y0 = load(lanes, lane_values, row.X * width), load(lanes, lane_values, row.Y * width)
     total, moment_x, moment_y = zero, zero, zero
     for y in range(ny):
         weight_y = load(lanes, profiles, (2 * padded + y) * width)
-        row, row_x = zero, zero
+        line, line_x = zero, zero
         for x in range(nx):
             weighted = load(lanes, profiles, x * width) * load(lanes, image, (y * nx + x) * width)
-            row = row + weighted
-            row_x = multiply_add(weighted, splat(lanes, x - 0.5 * (nx - 1)), row_x)
-        total = multiply_add(row, weight_y, total)
-        moment_x = multiply_add(row_x, weight_y, moment_x)
-        moment_y = multiply_add(row * weight_y, splat(lanes, y - 0.5 * (ny - 1)), moment_y)
+            line = line + weighted
+            line_x = multiply_add(weighted, splat(lanes, x - 0.5 * (nx - 1)), line_x)
+        total = multiply_add(line, weight_y, total)
+        moment_x = multiply_add(line_x, weight_y, moment_x)
+        moment_y = multiply_add(line * weight_y, splat(lanes, y - 0.5 * (ny - 1)), moment_y)
     inverse = splat(lanes, 1.0) / maximum(total, floor)
-    most = load(lanes, lane_values, LARGEST_MOVE * width)
+    most = load(lanes, lane_values, row.LARGEST_MOVE * width)
     least = zero - most
-    dx = load(lanes, lane_values, GAIN_X * width) * ((moment_x - x0 * total) * inverse)
-    dy = load(lanes, lane_values, GAIN_Y * width) * ((moment_y - y0 * total) * inverse)
+    dx = load(lanes, lane_values, row.GAIN_X * width) * ((moment_x - x0 * total) * inverse)
+    dy = load(lanes, lane_values, row.GAIN_Y * width) * ((moment_y - y0 * total) * inverse)
     dx, dy = minimum(maximum(dx, least), most), minimum(maximum(dy, least), most)
-    store(lane_values, MOVE_BEFORE * width, load(lanes, lane_values, MOVE * width))
-    store(lane_values, MOVE * width, maximum(absolute(dx), absolute(dy)))
+    store(lane_values, row.MOVE_BEFORE * width, load(lanes, lane_values, row.MOVE * width))
+    store(lane_values, row.MOVE * width, maximum(absolute(dx), absolute(dy)))
     x0, y0 = x0 + dx, y0 + dy
-    low, high = load(lanes, lane_values, LOW_X * width), load(lanes, lane_values, HIGH_X * width)
-    store(lane_values, X * width, minimum(maximum(x0, low), high))
-    low, high = load(lanes, lane_values, LOW_Y * width), load(lanes, lane_values, HIGH_Y * width)
-    store(lane_values, Y * width, minimum(maximum(y0, low), high))
+    low, high = load(lanes, lane_values, row.LOW_X * width), load(lanes, lane_values, row.HIGH_X * width)
+    store(lane_values, row.X * width, minimum(maximum(x0, low), high))
+    low, high = load(lanes, lane_values, row.LOW_Y * width), load(lanes, lane_values, row.HIGH_Y * width)
+    store(lane_values, row.Y * width, minimum(maximum(y0, low), high))
 
 
 @compiled
@@ -104,8 +75,8 @@ def _store_errors(
     width = width_of(lanes)
     padded = profiles.shape[3]
     zero = splat(lanes, 0.0)
-    v, e = load(lanes, lane_values, VARIANCE * width), load(lanes, lane_values, EXCESS * width)
-    x0, y0 = load(lanes, lane_values, X * width), load(lanes, lane_values, Y * width)
+    v, e = load(lanes, lane_values, row.VARIANCE * width), load(lanes, lane_values, row.EXCESS * width)
+    x0, y0 = load(lanes, lane_values, row.X * width), load(lanes, lane_values, row.Y * width)
     total, noise_x, noise_y, noise_xy, noise, dark_x, dark_y = zero, zero, zero, zero, zero, zero, zero
     for y in range(ny):
         weight_y = load(lanes, profiles, (2 * padded + y) * width)
@@ -128,22 +99,25 @@ def _store_errors(
     least = splat(lanes, SMALLEST_VARIANCE)
     illuminated = total > floor
     inverse = splat(lanes, 1.0) / maximum(total, floor)
-    gain_x, gain_y = load(lanes, lane_values, GAIN_X * width), load(lanes, lane_values, GAIN_Y * width)
+    gain_x, gain_y = (
+        load(lanes, lane_values, row.GAIN_X * width),
+        load(lanes, lane_values, row.GAIN_Y * width),
+    )
     unknown = splat(lanes, math.inf)
     # Pixels that noise has made negative must not take away more than the flux's own noise.
     noise_x = maximum(noise_x, maximum(v, least) * dark_x)
     noise_y = maximum(noise_y, maximum(v, least) * dark_y)
     error_x = gain_x * gain_x * inverse * inverse * noise_x
     error_y = gain_y * gain_y * inverse * inverse * noise_y
-    store(lane_values, ERROR_X * width, select(illuminated, error_x, unknown))
-    store(lane_values, ERROR_Y * width, select(illuminated, error_y, unknown))
-    store(lane_values, COVARIANCE * width, gain_x * gain_y * inverse * inverse * noise_xy)
-    store(lane_values, SEEN * width, total)
-    store(lane_values, SEEN_ERROR * width, maximum(noise, least))
+    store(lane_values, row.ERROR_X * width, select(illuminated, error_x, unknown))
+    store(lane_values, row.ERROR_Y * width, select(illuminated, error_y, unknown))
+    store(lane_values, row.COVARIANCE * width, gain_x * gain_y * inverse * inverse * noise_xy)
+    store(lane_values, row.SEEN * width, total)
+    store(lane_values, row.SEEN_ERROR * width, maximum(noise, least))
     for lane in range(width):
-        lane_values[SEEN_ERROR * width + lane] = math.sqrt(lane_values[SEEN_ERROR * width + lane])
-        for row in (ERROR_X, ERROR_Y):
-            lane_values[row * width + lane] = math.sqrt(max(lane_values[row * width + lane], 0.0))
+        lane_values[row.SEEN_ERROR * width + lane] = math.sqrt(lane_values[row.SEEN_ERROR * width + lane])
+        for error in (row.ERROR_X, row.ERROR_Y):
+            lane_values[error * width + lane] = math.sqrt(max(lane_values[error * width + lane], 0.0))
 
 
 @compiled
@@ -166,7 +140,7 @@ def weigh_group(
     The tables hold the weight's profile, 1 at its centre.
     """
     width = width_of(lanes)
-    floor = splat(lanes, LEAST_FRACTION) * load(lanes, lane_values, FLUX * width)
+    floor = splat(lanes, LEAST_FRACTION) * load(lanes, lane_values, row.FLUX * width)
     for _ in range(steps):
         look_up(lanes, tables, which, ny, nx, lane_values, starts, profiles)
         _move(lanes, image, ny, nx, profiles, floor, lane_values)
@@ -221,11 +195,11 @@ def _log_likelihood(lanes: Any, rows: Any, lane: Any, tables: Any, table: Any, p
     at = (table * tables.shape[1] + position) * count * width
     # Two sums: the next multiplication need not wait for the last.
     even, odd = splat(lanes, 0.0), splat(lanes, 0.0)
-    for row in range(0, count - 1, 2):
-        g = load(lanes, rows, (row * width + lane) * width)
-        even = multiply_add(g, load(lanes, tables, at + row * width), even)
-        g = load(lanes, rows, ((row + 1) * width + lane) * width)
-        odd = multiply_add(g, load(lanes, tables, at + (row + 1) * width), odd)
+    for y in range(0, count - 1, 2):
+        g = load(lanes, rows, (y * width + lane) * width)
+        even = multiply_add(g, load(lanes, tables, at + y * width), even)
+        g = load(lanes, rows, ((y + 1) * width + lane) * width)
+        odd = multiply_add(g, load(lanes, tables, at + (y + 1) * width), odd)
     if count % 2 == 1:
         g = load(lanes, rows, ((count - 1) * width + lane) * width)
         even = multiply_add(g, load(lanes, tables, at + (count - 1) * width), even)
@@ -276,12 +250,12 @@ def posterior_of_group(
     n = grid.shape[0]
     rows_from_lanes(lanes, image, ny, nx, starts, rows)
     for lane in range(width):
-        low_x, high_x = lane_values[LOW_X * width + lane], lane_values[HIGH_X * width + lane]
-        low_y, high_y = lane_values[LOW_Y * width + lane], lane_values[HIGH_Y * width + lane]
-        prior = float(lane_values[PRIOR_WEIGHT * width + lane])
+        low_x, high_x = lane_values[row.LOW_X * width + lane], lane_values[row.HIGH_X * width + lane]
+        low_y, high_y = lane_values[row.LOW_Y * width + lane], lane_values[row.HIGH_Y * width + lane]
+        prior = float(lane_values[row.PRIOR_WEIGHT * width + lane])
         prior_x, prior_y = (
-            float(lane_values[PRIOR_X * width + lane]),
-            float(lane_values[PRIOR_Y * width + lane]),
+            float(lane_values[row.PRIOR_X * width + lane]),
+            float(lane_values[row.PRIOR_Y * width + lane]),
         )
         largest = -math.inf
         for i in range(n):
@@ -312,9 +286,9 @@ def posterior_of_group(
         x, y = (sum_x * inverse, sum_y * inverse) if known else (prior_x, prior_y)
         spread_x = math.sqrt(max(squares_x * inverse - x * x, 0.0)) if known else 0.0
         spread_y = math.sqrt(max(squares_y * inverse - y * y, 0.0)) if known else 0.0
-        lane_values[MEAN_X * width + lane] = min(max(low_x, x), high_x)
-        lane_values[MEAN_Y * width + lane] = min(max(low_y, y), high_y)
-        lane_values[SPREAD_X * width + lane] = spread_x
-        lane_values[SPREAD_Y * width + lane] = spread_y
-        lane_values[SPREAD_XY * width + lane] = products * inverse - x * y if known else 0.0
-        lane_values[SPACING * width + lane] = spacing
+        lane_values[row.MEAN_X * width + lane] = min(max(low_x, x), high_x)
+        lane_values[row.MEAN_Y * width + lane] = min(max(low_y, y), high_y)
+        lane_values[row.SPREAD_X * width + lane] = spread_x
+        lane_values[row.SPREAD_Y * width + lane] = spread_y
+        lane_values[row.SPREAD_XY * width + lane] = products * inverse - x * y if known else 0.0
+        lane_values[row.SPACING * width + lane] = spacing
