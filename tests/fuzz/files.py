@@ -17,7 +17,7 @@ from tests.io import loop_layouts
 import faintspot as fs
 from faintspot.experiments.study.specification import StudySpecification
 from faintspot.io import open_frames, read_array, read_slopes
-from faintspot.io.formats.registry import frame_format
+from faintspot.io.frames import frame_format
 from faintspot.io.slopes import read_reference
 from faintspot.loop.simulation.configuration import LoopConfiguration, load_loop
 from faintspot.slopes.pipeline import configuration

@@ -14,7 +14,7 @@ from faintspot.base.tables import parse_changes
 from faintspot.cli.commands import KEY, NAMES, REFERENCE, configuration_option, option
 from faintspot.cli.output import progress_bar
 from faintspot.io.file_format import UNITS
-from faintspot.io.formats.registry import slope_format
+from faintspot.io.frames import slope_format
 from faintspot.io.stored_array import split_location
 from faintspot.slopes.recorded import Summary, measure_recorded
 

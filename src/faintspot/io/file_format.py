@@ -196,7 +196,7 @@ def json_values(name: str, value: Mapping[str, object]) -> dict[str, Any]:
 
 
 class FileFormat:
-    """A file format, implemented by a subclass in its own file and listed in `faintspot.io.formats.registry`.
+    """A file format, implemented by a subclass in its own file and listed in `faintspot.io.frames`.
 
     All programs load all formats, so a format imports its optional packages where it uses them.
     """

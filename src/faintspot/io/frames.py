@@ -1,4 +1,4 @@
-"""Input of frames: one sequence from files of any format, read in blocks of bounded memory."""
+"""Input of frames, in blocks of bounded memory; formats of files: subclasses of `FileFormat` in `formats`."""
 
 from __future__ import annotations
 
@@ -13,10 +13,75 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.base.errors import InputError, MissingExtraError
-from faintspot.base.files import Closing, check_bytes, check_size
-from faintspot.io.formats.registry import frame_format
+from faintspot.base.errors import InputError, MissingExtraError, import_modules
+from faintspot.base.files import Closing, check_bytes, check_regular, check_size
+from faintspot.io.file_format import FileFormat
 from faintspot.io.stored_array import MOST_WHOLE_BYTES, StoredArray, arranged, one_line, split_location
+
+import_modules("faintspot.io.formats")
+
+
+def _below(kind: type[FileFormat]) -> Iterator[type[FileFormat]]:
+    for below in kind.__subclasses__():
+        yield below
+        yield from _below(below)
+
+
+FORMATS: tuple[FileFormat, ...] = tuple(
+    kind() for kind in _below(FileFormat) if not kind.__name__.startswith("_")
+)
+_SIGNATURE_BYTES = 8
+
+
+def frame_format(path: Path) -> FileFormat:
+    """Return the format of a file of frames, recognised by content.
+
+    Raises
+    ------
+    InputError
+        When it has no known format.
+    OSError
+        When it cannot be read.
+    """
+    start = b""
+    if not path.is_dir():
+        check_regular(path)
+        with path.open("rb") as stream:
+            start = stream.read(_SIGNATURE_BYTES)
+        if not start:
+            raise InputError(f"{path}: expected frames, the file is empty")
+    for item in FORMATS:
+        if item.has_frames(path, start):
+            return item
+    names = list(dict.fromkeys(item.name for item in FORMATS if item.signatures))
+    raise InputError(
+        f"{path}: expected a {_listed(names)} file, a text (.csv, .txt, .dat) or a Zarr store, it is none of "
+        "them"
+    )
+
+
+def slope_format(path: Path) -> FileFormat:
+    """Return the format of a file of slopes, by the ending of its name.
+
+    Raises
+    ------
+    InputError
+        When the ending is unknown.
+    """
+    for item in FORMATS:
+        if path.name.lower().endswith(item.endings):
+            return item
+    raise InputError(f"{path}: expected a name ending in {_listed(slope_endings())}")
+
+
+def slope_endings() -> list[str]:
+    """Return all endings of files of slopes."""
+    return [ending for item in FORMATS for ending in item.endings]
+
+
+def _listed(names: list[str]) -> str:
+    return f"{', '.join(names[:-1])} or {names[-1]}"
+
 
 _MOST_PIXELS = 1 << 26  # in a frame: 8192 x 8192
 

@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 from faintspot.base.errors import InputError, errors_within
 from faintspot.io.fits_units import units_of
 from faintspot.io.formats.csv_files import TEXTS
-from faintspot.io.formats.registry import frame_format
-from faintspot.io.frames import read_array
+from faintspot.io.frames import frame_format, read_array
 
 _KECK_TICK_S = 1e-7
 

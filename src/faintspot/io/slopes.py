@@ -24,9 +24,8 @@ from faintspot.io.file_format import (
     json_values,
     pixels_in,
 )
-from faintspot.io.formats.registry import slope_endings, slope_format
 from faintspot.io.formats.zarr_files import SlopeStore, Zarr, describe_store, remove_store
-from faintspot.io.frames import read_array
+from faintspot.io.frames import read_array, slope_endings, slope_format
 from faintspot.io.slopes_writer import OutputLock, SlopeWriter
 from faintspot.io.stored_array import one_line, split_location
 

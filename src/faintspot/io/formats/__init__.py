@@ -1,1 +1,1 @@
-"""File formats: `registry` lists them, then files for each kind; `io.file_format` is the interface."""
+"""File formats, found by `io.frames`: one module for each kind; `io.file_format` is the interface."""

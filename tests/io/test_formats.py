@@ -14,10 +14,9 @@ from tests.io.slope_format_tests import SlopeFormatTests
 from tests.refusals import refused
 
 from faintspot.base.flags import VARIABLES
-from faintspot.io import open_frames
+from faintspot.io import frames, open_frames
 from faintspot.io.file_format import FileFormat, StoredSlopes
 from faintspot.io.fits_units import StreamedArray
-from faintspot.io.formats import registry
 from faintspot.io.stored_array import StoredArray
 
 
@@ -65,7 +64,7 @@ def save(path: Path, frames: NDArray[Any]) -> None:
 
 @pytest.fixture(autouse=True)
 def one_more_format(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(registry, "FORMATS", (*registry.FORMATS, Plain()))
+    monkeypatch.setattr(frames, "FORMATS", (*frames.FORMATS, Plain()))
 
 
 class TestFrames(FrameFormatTests):
