@@ -31,13 +31,7 @@ numcodecs: Any = pytest.importorskip("numcodecs")
 @pytest.fixture(autouse=True)
 def small_limits(monkeypatch: pytest.MonkeyPatch) -> None:
     """Limits of 8 MiB, so that files that exceed them are made quickly."""
-    for module in (
-        "frames",
-        "arrays.stored_array",
-        "arrays.zarr_store",
-        "arrays.inflation",
-        "arrays.fits_units",
-    ):
+    for module in ("frames", "stored_array", "zarr_store", "fits_units"):
         monkeypatch.setattr(f"faintspot.io.{module}.MOST_WHOLE_BYTES", 8 * MIB)
     monkeypatch.setattr(read_arrays, "__defaults__", (None, (), 8 * MIB))
     monkeypatch.setattr(file_format, "memory_bytes", lambda: 16 * MIB)
