@@ -36,9 +36,9 @@ from benchmarks.control import random_filter
 from benchmarks.measuring import Row, Table
 from faintspot.engine.child_processes import real_time
 from faintspot.engine.engine import Engine
-from faintspot.engine.path.timing import Latencies
-from faintspot.engine.pixels.pixel_ring import PixelRing
-from faintspot.engine.settings.plan import EngineOptions
+from faintspot.engine.pixel_ring import PixelRing
+from faintspot.engine.plan import EngineOptions
+from faintspot.engine.timing import Latencies
 from faintspot.loop.control import integrator
 from faintspot.loop.control.base import CommandDelayLine, Controller
 from faintspot.loop.control.configuration import Control

@@ -27,8 +27,8 @@ from benchmarks.measuring import Row, Table, spread
 from benchmarks.rivals import problem
 from benchmarks.scale import settings, settings_in_words
 from faintspot.engine.child_processes import real_time
-from faintspot.engine.path.frame_path import FramePath, Progress
-from faintspot.engine.path.workers import Workers
+from faintspot.engine.frame_path import FramePath, Progress
+from faintspot.engine.workers import Workers
 from faintspot.slopes.kernels.parallel import available_cpus
 
 FRAMES = {36: 40_000, 1208: 5_000}

@@ -50,7 +50,7 @@ from benchmarks.measuring import (
     ratio,
     spread,
 )
-from faintspot.engine.path.frame_path import FramePath, Progress
+from faintspot.engine.frame_path import FramePath, Progress
 from faintspot.engine.requests import request, socket_path
 
 SIDE, PIXELS, LEVEL_ADU, RATE_HZ = 6, 16, 100, 300.0

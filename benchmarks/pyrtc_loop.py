@@ -43,7 +43,7 @@ from numpy.typing import NDArray
 from benchmarks import pyrtc
 from benchmarks.measuring import Row, Table, Times, median_ratio, spread
 from benchmarks.pyrtc import LEVEL_ADU, PIXELS, RATE_HZ, SIDE
-from faintspot.engine.pixels.pixel_ring import PixelRing
+from faintspot.engine.pixel_ring import PixelRing
 from faintspot.engine.requests import LENGTHY_TIMEOUT_S, request, socket_path
 from faintspot.loop.control.configuration import Control
 

@@ -26,8 +26,8 @@ from benchmarks.measuring import Row, Table, Times, median_ratio, spread
 from benchmarks.realtime_processes import SMALL, USUAL, engine_and_camera
 from faintspot import Calibration, Layout, Settings, SlopePipeline
 from faintspot.engine.engine import Engine
-from faintspot.engine.pixels.pixel_ring import PixelRing
-from faintspot.engine.settings.plan import EngineOptions
+from faintspot.engine.pixel_ring import PixelRing
+from faintspot.engine.plan import EngineOptions
 
 FRAMES, RATE_HZ, ROWS = 1500, 300, 112
 ROUNDS = 3

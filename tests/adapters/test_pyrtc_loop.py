@@ -15,7 +15,7 @@ import faintspot as fs
 from faintspot import InputError, MissingExtraError, Settings
 from faintspot.adapters import pyrtc
 from faintspot.adapters.pyrtc import _Frames, _Measuring
-from faintspot.engine.pixels.segment import FOLDER
+from faintspot.engine.segment import FOLDER
 
 SHAPE = (6, 5)
 FILES = ROOT / "examples" / "pyrtc"

@@ -26,7 +26,7 @@ from tests.loop.telemetry.alternation_cases import (
 )
 from tests.loop.telemetry.loop_cases import recorded
 
-from faintspot.engine.pixels.segment import FOLDER
+from faintspot.engine.segment import FOLDER
 from faintspot.engine.telemetry.ring import TelemetryRing
 from faintspot.io import read_telemetry
 from faintspot.slopes.pipeline.slopes import RESULT_TYPES, Slopes

@@ -13,8 +13,8 @@ from tests.simulated import frames_of
 import faintspot as fs
 from faintspot.base.files import Closing
 from faintspot.engine.engine import Engine
-from faintspot.engine.pixels.pixel_ring import PixelRing
-from faintspot.engine.settings.plan import EngineOptions
+from faintspot.engine.pixel_ring import PixelRing
+from faintspot.engine.plan import EngineOptions
 from faintspot.engine.telemetry.ring import TelemetryRing
 
 LAYOUT = fs.Layout.grid((4, 4), pixels=8)

@@ -8,8 +8,8 @@ import pytest
 from tests.engine.commands import start
 from tests.patience import LIMIT_S, wait_for
 
-from faintspot.engine.pixels.pixel_ring import PixelRing
-from faintspot.engine.pixels.segment import FOLDER
+from faintspot.engine.pixel_ring import PixelRing
+from faintspot.engine.segment import FOLDER
 
 pyshmem = pytest.importorskip("pyshmem")
 pytestmark = [

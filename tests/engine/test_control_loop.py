@@ -14,7 +14,7 @@ from tests.patience import examples
 
 from faintspot.base.errors import InputError
 from faintspot.engine.control_loop import ControlLoop
-from faintspot.engine.path.workers import SlopePrior
+from faintspot.engine.workers import SlopePrior
 from faintspot.loop.control import integrator
 from faintspot.loop.control.base import CONTROLS, INTEGRATOR, CommandDelayLine, Controller
 from faintspot.loop.control.configuration import Control

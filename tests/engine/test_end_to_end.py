@@ -13,7 +13,7 @@ import pytest
 from tests.patience import LIMIT_S, wait_for
 
 import faintspot as fs
-from faintspot.engine.pixels.pixel_ring import PixelRing
+from faintspot.engine.pixel_ring import PixelRing
 from faintspot.engine.requests import socket_path
 
 pyshmem = pytest.importorskip("pyshmem")

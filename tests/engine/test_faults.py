@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 from tests.engine.bench import SETTINGS, Bench, make, simulated
 
-from faintspot.engine.path.timing import CAUSES, INCOMPLETE
-from faintspot.engine.pixels.segment import FOLDER
+from faintspot.engine.segment import FOLDER
+from faintspot.engine.timing import CAUSES, INCOMPLETE
 
 pyshmem = pytest.importorskip("pyshmem")
 

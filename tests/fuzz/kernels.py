@@ -29,8 +29,8 @@ from tests.fuzz.refused import refused_in_one_line
 
 import faintspot as fs
 from faintspot.base.tables import PRESETS
-from faintspot.engine.path import frame_path
-from faintspot.engine.path.frame_path import FramePath, Progress
+from faintspot.engine import frame_path
+from faintspot.engine.frame_path import FramePath, Progress
 from faintspot.slopes.estimators import estimators
 from faintspot.slopes.estimators.centroid import brightest_pixels
 from faintspot.slopes.kernels import parallel

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from faintspot.base.checks import number_between
 from faintspot.base.errors import InputError
 from faintspot.engine.guard import ControllerSuccessor, Guard, PreparedController
-from faintspot.engine.path.timing import Latencies
-from faintspot.engine.path.workers import SlopePrior
+from faintspot.engine.timing import Latencies
+from faintspot.engine.workers import SlopePrior
 from faintspot.loop.control.base import KALMAN, CommandDelayLine, Controller
 from faintspot.loop.control.configuration import Control
 from faintspot.loop.control.integrator import MEAN_SQUARE, true_slopes

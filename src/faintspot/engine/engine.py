@@ -12,13 +12,11 @@ import numpy as np
 
 from faintspot.base.errors import InputError
 from faintspot.engine.control_loop import CLOSED, OPEN, STATES, ControlLoop
-from faintspot.engine.path.frame_path import FramePath
-from faintspot.engine.path.timing import INCOMPLETE, WORKER, FrameAccount
-from faintspot.engine.path.workers import SlopePrior, Workers
-from faintspot.engine.pixels.pixel_ring import PixelRing, living_ring
-from faintspot.engine.settings.estimators import EngineEstimators
-from faintspot.engine.settings.interleaving import EVERY, FIRST_METHOD, METHODS, Interleaving
-from faintspot.engine.settings.plan import (
+from faintspot.engine.estimators import EngineEstimators
+from faintspot.engine.frame_path import FramePath
+from faintspot.engine.interleaving import EVERY, FIRST_METHOD, METHODS, Interleaving
+from faintspot.engine.pixel_ring import PixelRing, living_ring
+from faintspot.engine.plan import (
     DarkFollower,
     EngineOptions,
     EnginePlan,
@@ -26,9 +24,11 @@ from faintspot.engine.settings.plan import (
     FrameInput,
     SettingsPreparer,
 )
-from faintspot.engine.settings.running_settings import Change, RunningSettings
+from faintspot.engine.running_settings import Change, RunningSettings
 from faintspot.engine.streams.slope_streams import SlopeStreams
 from faintspot.engine.telemetry.ring import TelemetryRing
+from faintspot.engine.timing import INCOMPLETE, WORKER, FrameAccount
+from faintspot.engine.workers import SlopePrior, Workers
 from faintspot.loop.control.configuration import Control, packed_control
 from faintspot.loop.control.options import NONE, STREAM
 from faintspot.slopes.pipeline.configuration import packed, to_text

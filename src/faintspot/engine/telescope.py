@@ -17,10 +17,10 @@ from faintspot.base.checks import not_none, number_between, numbers_between
 from faintspot.base.errors import InputError
 from faintspot.base.files import Closing
 from faintspot.base.text_files import check_keys
-from faintspot.engine.pixels.pixel_ring import PixelRing
-from faintspot.engine.pixels.readout import CameraReport, Readout, RowTimes, StopEvent, readout_type
+from faintspot.engine.pixel_ring import PixelRing
+from faintspot.engine.readout import CameraReport, Readout, RowTimes, StopEvent, readout_type
 from faintspot.engine.requests import EFFECT_TIMEOUT_S, Handler, changes_of
-from faintspot.engine.streams.command_stream import CommandStream
+from faintspot.engine.streams.bridge import CommandStream
 from faintspot.engine.streams.shared_streams import create_stream, held
 from faintspot.loop.simulation.configuration import LoopConfiguration
 from faintspot.loop.simulation.telescope import TelescopeModel, make_detector

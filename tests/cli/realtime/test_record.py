@@ -15,7 +15,7 @@ from tests.engine.telemetry_cases import LAYOUT, SETTINGS, Engine, as_written
 from faintspot.base.errors import InputError
 from faintspot.cli.realtime.control import record
 from faintspot.cli.report import export as export
-from faintspot.engine.pixels.segment import FOLDER
+from faintspot.engine.segment import FOLDER
 from faintspot.engine.telemetry.ring import TelemetryRing
 from faintspot.io import read_telemetry
 

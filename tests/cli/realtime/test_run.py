@@ -14,8 +14,8 @@ from tests.loop.control.control_cases import INTERACTION
 from faintspot import Layout, Settings
 from faintspot.base.errors import InputError
 from faintspot.engine import engine
-from faintspot.engine.pixels.segment import FOLDER
-from faintspot.engine.settings.plan import EngineOptions
+from faintspot.engine.plan import EngineOptions
+from faintspot.engine.segment import FOLDER
 from faintspot.loop.control.configuration import save_control
 
 pytestmark = pytest.mark.skipif(not FOLDER.is_dir(), reason="needs POSIX shared memory as Linux has it")

@@ -15,8 +15,8 @@ from tests.cli.cli_cases import Commands, command_line
 from faintspot.base.errors import InputError
 from faintspot.cli.realtime.telescope import _StrehlFile, in_words, methods_table
 from faintspot.engine.page.demonstration import Shown
-from faintspot.engine.pixels.segment import FOLDER
 from faintspot.engine.requests import ControlServer, request, socket_path
+from faintspot.engine.segment import FOLDER
 
 
 def test_times_are_those_of_the_middle_of_an_exposure(tmp_path: Path) -> None:

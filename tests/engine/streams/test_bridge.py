@@ -13,8 +13,8 @@ import pytest
 from tests.patience import wait_for
 
 from faintspot.base.errors import InputError
-from faintspot.engine.pixels.pixel_ring import PixelRing
-from faintspot.engine.pixels.segment import FOLDER
+from faintspot.engine.pixel_ring import PixelRing
+from faintspot.engine.segment import FOLDER
 from faintspot.engine.streams import bridge as bridge_module
 from faintspot.engine.streams.bridge import BridgeCounters, StreamBridge
 

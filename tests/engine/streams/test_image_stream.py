@@ -14,10 +14,9 @@ from tests.engine.image_files import IsioFile
 from tests.patience import LIMIT_S, wait_for
 
 from faintspot.base.errors import InputError
-from faintspot.engine.pixels.pixel_ring import PixelRing
-from faintspot.engine.pixels.segment import FOLDER
-from faintspot.engine.streams.bridge import StreamBridge
-from faintspot.engine.streams.command_stream import StreamOut
+from faintspot.engine.pixel_ring import PixelRing
+from faintspot.engine.segment import FOLDER
+from faintspot.engine.streams.bridge import StreamBridge, StreamOut
 from faintspot.engine.streams.image_layout import IncompatibleStreamError
 from faintspot.engine.streams.image_stream import ImageStream, ImageStreamWriter
 from faintspot.engine.streams.stream import Follower, open_stream

@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 
 from faintspot.base.errors import InputError
-from faintspot.engine.pixels.segment import FOLDER
+from faintspot.engine.segment import FOLDER
 from faintspot.engine.streams import shared_streams
 from faintspot.engine.streams.shared_streams import create_stream, lock_file, pyshmem_module
 from faintspot.engine.streams.slope_streams import SlopeStreams

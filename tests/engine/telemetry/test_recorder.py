@@ -20,7 +20,7 @@ from tests.engine.telemetry_cases import LAYOUT, SETTINGS, Engine, as_written, w
 from tests.patience import wait_for
 
 from faintspot.base.errors import InputError
-from faintspot.engine.pixels.segment import FOLDER
+from faintspot.engine.segment import FOLDER
 from faintspot.engine.telemetry import recorder
 from faintspot.engine.telemetry.recorder import Recorder, TelemetryStore
 from faintspot.engine.telemetry.ring import TelemetryRing

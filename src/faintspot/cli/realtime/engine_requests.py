@@ -15,7 +15,7 @@ import click
 from faintspot.engine.requests import ENGINE, LENGTHY_TIMEOUT_S, request, socket_path
 
 if TYPE_CHECKING:
-    from faintspot.engine.pixels.readout import CameraReport
+    from faintspot.engine.readout import CameraReport
 
 
 PATIENCE_S = 2.0

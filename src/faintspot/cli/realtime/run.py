@@ -176,11 +176,11 @@ def run(
     from faintspot.base.errors import InputError
     from faintspot.engine.child_processes import real_time
     from faintspot.engine.engine import Engine
-    from faintspot.engine.path.workers import PipelineMaker
+    from faintspot.engine.interleaving import Interleaving
+    from faintspot.engine.plan import EngineOptions
     from faintspot.engine.request_handlers import LENGTHY, commands_of
     from faintspot.engine.requests import ControlServer
-    from faintspot.engine.settings.interleaving import Interleaving
-    from faintspot.engine.settings.plan import EngineOptions
+    from faintspot.engine.workers import PipelineMaker
     from faintspot.loop.control.configuration import load_control
     from faintspot.slopes.pipeline.configuration import Configuration
 

@@ -16,7 +16,7 @@ from faintspot.cli.output import progress_bar
 from faintspot.cli.realtime.engine_requests import published, stop_on_signal
 
 if TYPE_CHECKING:
-    from faintspot.engine.streams.command_stream import StreamOut
+    from faintspot.engine.streams.bridge import StreamOut
 
 _HEAD_START_S = 0.5
 _DEFAULT_RATE_HZ = 500.0
@@ -67,8 +67,8 @@ def replay(
       faintspot realtime replay cube.npy --frame-rate-hz 1000 --rows-per-block 4 --frames 1000 --repeat
     """
     from faintspot.engine.child_processes import quick_switching
-    from faintspot.engine.pixels.pixel_ring import PixelRing
-    from faintspot.engine.pixels.readout import Replay, ring_type
+    from faintspot.engine.pixel_ring import PixelRing
+    from faintspot.engine.readout import Replay, ring_type
     from faintspot.io import open_frames
 
     repeat = options["repeat"]
@@ -133,8 +133,7 @@ def bridge(
     if frames is not None and not stream:
         raise InputError("--frames: expected a stream of frames, got none")
     from faintspot.engine.child_processes import quick_switching
-    from faintspot.engine.streams.bridge import StreamBridge
-    from faintspot.engine.streams.command_stream import StreamOut
+    from faintspot.engine.streams.bridge import StreamBridge, StreamOut
 
     def say(line: str) -> None:
         click.echo(f"{name}: {line}")

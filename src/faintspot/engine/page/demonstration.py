@@ -16,9 +16,9 @@ from faintspot.base.errors import InputError
 from faintspot.base.files import Closing, derived, output_errors, write_atomically
 from faintspot.engine.child_processes import ONE_THREAD, ChildProcesses
 from faintspot.engine.control_loop import CLOSED, STATES
-from faintspot.engine.pixels.readout import StopEvent
+from faintspot.engine.interleaving import short_names
+from faintspot.engine.readout import StopEvent
 from faintspot.engine.requests import LENGTHY_TIMEOUT_S, request, socket_path
-from faintspot.engine.settings.interleaving import short_names
 from faintspot.engine.streams.stream import Follower
 from faintspot.engine.telemetry.numbers import MethodDifference, compared_methods
 from faintspot.engine.telemetry.ring import TelemetryRing

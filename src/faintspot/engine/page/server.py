@@ -22,7 +22,7 @@ from faintspot.engine.page.client_requests import Access, ClientRequests, Engine
 from faintspot.engine.page.engine_source import EngineSource, RecordingSource
 from faintspot.engine.page.page import UPDATE_S, LatestMessages, Page, StatusPoller, packed
 from faintspot.engine.page.page_state import BatchSource
-from faintspot.engine.pixels.readout import StopEvent
+from faintspot.engine.readout import StopEvent
 
 try:
     from tornado.httpserver import HTTPServer

@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.errors import InputError
-from faintspot.engine.path.workers import SlopePrior
 from faintspot.engine.streams.shared_streams import (
     LOCK_LIMIT_S,
     create_stream,
@@ -22,6 +21,7 @@ from faintspot.engine.streams.shared_streams import (
     pyshmem_module,
 )
 from faintspot.engine.streams.stream import Follower
+from faintspot.engine.workers import SlopePrior
 from faintspot.slopes.kernels.compiling import Direct
 from faintspot.slopes.kernels.products import fill_telemetry_rows
 from faintspot.slopes.pipeline.slopes import RESULT_TYPES, Slopes

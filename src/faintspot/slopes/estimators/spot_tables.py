@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.slopes.kernels.smoothing import SMALLEST_VARIANCE
+from faintspot.slopes.kernels.brightest import SMALLEST_VARIANCE
 from faintspot.slopes.kernels.spot_rows import MARGIN, PHASES
 from faintspot.slopes.spots.psf import PSF
 from faintspot.slopes.spots.shapes import FWHM_TO_STD

@@ -9,6 +9,12 @@ import numpy as np
 
 from faintspot.base.flags import SubapertureFlag
 from faintspot.slopes.kernels import groups, spot_rows
+from faintspot.slopes.kernels.brightest import (
+    SMALLEST_VARIANCE,
+    gather_taps,
+    variance_of,
+    without_noisy_pixels,
+)
 from faintspot.slopes.kernels.compiling import compiled
 from faintspot.slopes.kernels.groups import (
     COMMON_ROWS,
@@ -25,12 +31,6 @@ from faintspot.slopes.kernels.host import aligned_zeros
 from faintspot.slopes.kernels.likelihood import fit_group
 from faintspot.slopes.kernels.means import posterior_of_group, weigh_group
 from faintspot.slopes.kernels.simd import Lanes, load, rounded, select, splat, store, width_of
-from faintspot.slopes.kernels.smoothing import (
-    SMALLEST_VARIANCE,
-    gather_taps,
-    variance_of,
-    without_noisy_pixels,
-)
 from faintspot.slopes.kernels.spot_rows import LEAST_FLUX_E, find_start, subtract_background
 
 # Rows of the settings' table that follow the common ones: flux that is expected; weights of a fit; prior.

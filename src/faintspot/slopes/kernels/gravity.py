@@ -10,6 +10,7 @@ import numpy as np
 from faintspot.base.flags import SubapertureFlag
 from faintspot.slopes.kernels import brightest
 from faintspot.slopes.kernels import denoise as total_variation
+from faintspot.slopes.kernels.brightest import gather_taps, smooth_group
 from faintspot.slopes.kernels.compiling import compiled
 from faintspot.slopes.kernels.denoise import denoise_group
 from faintspot.slopes.kernels.gather import gather_images, scatter_images
@@ -26,7 +27,6 @@ from faintspot.slopes.kernels.groups import (
 )
 from faintspot.slopes.kernels.host import aligned_zeros
 from faintspot.slopes.kernels.simd import Lanes, load, splat, store, width_of
-from faintspot.slopes.kernels.smoothing import gather_taps, smooth_group
 from faintspot.slopes.kernels.sweeps import STATE_VECTORS
 
 _find_threshold = brightest.find_threshold

@@ -6,6 +6,7 @@ import math
 from typing import Any
 
 from faintspot.slopes.kernels import spot_rows as row
+from faintspot.slopes.kernels.brightest import SMALLEST_VARIANCE, relative_variance, variance_of
 from faintspot.slopes.kernels.compiling import compiled
 from faintspot.slopes.kernels.simd import (
     absolute,
@@ -20,7 +21,6 @@ from faintspot.slopes.kernels.simd import (
     sum_of,
     width_of,
 )
-from faintspot.slopes.kernels.smoothing import SMALLEST_VARIANCE, relative_variance, variance_of
 from faintspot.slopes.kernels.spot_rows import look_up
 
 LEAST_FRACTION = 0.05  # of the flux at the start: less under the weight would only amplify noise

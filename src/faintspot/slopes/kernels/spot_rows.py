@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
+from faintspot.slopes.kernels.brightest import smooth_pixel, variance_of, weight_variance_of
 from faintspot.slopes.kernels.compiling import compiled, inlined
 from faintspot.slopes.kernels.simd import (
     copy_transposed,
@@ -18,7 +19,6 @@ from faintspot.slopes.kernels.simd import (
     store,
     width_of,
 )
-from faintspot.slopes.kernels.smoothing import smooth_pixel, variance_of, weight_variance_of
 
 # In: allowed positions, px.
 LOW_X, HIGH_X, LOW_Y, HIGH_Y = range(4)

@@ -18,8 +18,8 @@ from faintspot.slopes.estimators.registry import register
 from faintspot.slopes.estimators.sensor import Scene, Sensor
 from faintspot.slopes.estimators.spot_tables import SpotModel
 from faintspot.slopes.kernels import fits as spot_fits
+from faintspot.slopes.kernels.brightest import SMALLEST_VARIANCE
 from faintspot.slopes.kernels.groups import RANGE
-from faintspot.slopes.kernels.smoothing import SMALLEST_VARIANCE
 
 Floats = NDArray[np.float64]
 

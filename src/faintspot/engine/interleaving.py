@@ -9,7 +9,7 @@ from typing import Any
 from faintspot.base.checks import number_between
 from faintspot.base.errors import InputError
 from faintspot.base.tables import parse_changes
-from faintspot.engine.settings.running_settings import check_names
+from faintspot.engine.running_settings import check_names
 from faintspot.loop.control.base import CONTROLS, split_control
 from faintspot.slopes.estimators.registry import estimators
 from faintspot.slopes.pipeline.settings import Settings, without_denoising

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from tests.patience import LIMIT_S, wait_for
 
-from faintspot.engine.path.workers import SlopePrior, Workers
+from faintspot.engine.workers import SlopePrior, Workers
 
 
 @pytest.fixture

@@ -10,7 +10,7 @@ from dataclasses import asdict, dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.engine.path.frame_path import FramePath
+from faintspot.engine.frame_path import FramePath
 from faintspot.io.telemetry import left_out
 
 _BITS = 7  # 2^7 bins in every factor of 2: each is at most 1/128 of its value wide

@@ -11,10 +11,10 @@ import pytest
 from numpy.typing import NDArray
 from tests.refusals import assert_each_refused, refused
 
-from faintspot.engine.pixels import readout
-from faintspot.engine.pixels.pixel_ring import PixelRing
-from faintspot.engine.pixels.readout import Readout, readout_type
-from faintspot.engine.pixels.segment import FOLDER
+from faintspot.engine import readout
+from faintspot.engine.pixel_ring import PixelRing
+from faintspot.engine.readout import Readout, readout_type
+from faintspot.engine.segment import FOLDER
 from faintspot.slopes.simulate import Detector
 
 pytestmark = [

@@ -15,9 +15,9 @@ from tests.patience import wait_for
 
 import faintspot as fs
 from faintspot.base.flags import INVALID
-from faintspot.engine.path.frame_path import Progress
-from faintspot.engine.path.python_path import PythonPath, call_is_under_way, call_within, end_thread, tried
-from faintspot.engine.path.workers import SlopePrior
+from faintspot.engine.frame_path import Progress
+from faintspot.engine.python_path import PythonPath, call_is_under_way, call_within, end_thread, tried
+from faintspot.engine.workers import SlopePrior
 from faintspot.slopes.estimators import Estimator, Positions
 
 pytestmark = pytest.mark.slow

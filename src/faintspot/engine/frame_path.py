@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.errors import InputError
-from faintspot.engine.path.workers import SlopePrior, Workers
+from faintspot.engine.workers import SlopePrior, Workers
 from faintspot.loop.control.configuration import prior_std_px
 from faintspot.slopes.kernels import streaming
 from faintspot.slopes.kernels.compiling import Direct

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from faintspot.base.checks import number_between
 from faintspot.base.errors import InputError
-from faintspot.engine.pixels.pixel_ring import PixelRing
+from faintspot.engine.pixel_ring import PixelRing
 from faintspot.slopes.simulate import Detector
 
 if TYPE_CHECKING:

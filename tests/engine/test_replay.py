@@ -16,11 +16,11 @@ from tests.refusals import assert_each_refused, refused
 from faintspot.base.errors import InputError
 from faintspot.cli.realtime import sources as realtime_sources
 from faintspot.cli.realtime.sources import replay
+from faintspot.engine import readout as replay_module
 from faintspot.engine.child_processes import quick_switching
-from faintspot.engine.pixels import readout as replay_module
-from faintspot.engine.pixels.pixel_ring import PixelRing
-from faintspot.engine.pixels.readout import Replay, ring_type
-from faintspot.engine.pixels.segment import FOLDER
+from faintspot.engine.pixel_ring import PixelRing
+from faintspot.engine.readout import Replay, ring_type
+from faintspot.engine.segment import FOLDER
 from faintspot.io import FrameSource, open_frames
 
 pytestmark = [

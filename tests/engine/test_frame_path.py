@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from tests.simulated import frames_of
 
 import faintspot as fs
-from faintspot.engine.path.frame_path import FramePath, Progress, last_rows_of_groups
-from faintspot.engine.path.workers import Workers
+from faintspot.engine.frame_path import FramePath, Progress, last_rows_of_groups
+from faintspot.engine.workers import Workers
 from faintspot.loop.control import integrator
 from faintspot.loop.control.integrator import SlopeProduct
 from faintspot.slopes.kernels.groups import SlopeArrays

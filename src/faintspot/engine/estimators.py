@@ -20,11 +20,11 @@ from typing import Any
 
 from faintspot.base.errors import InputError
 from faintspot.base.text_files import parse_json, to_json
-from faintspot.engine.path.python_path import call_within, tried
+from faintspot.engine.interleaving import EVERY, FIRST_METHOD, METHODS
+from faintspot.engine.plan import EnginePlan, SettingsPreparer
+from faintspot.engine.python_path import call_within, tried
 from faintspot.engine.requests import EFFECT_TIMEOUT_S
-from faintspot.engine.settings.interleaving import EVERY, FIRST_METHOD, METHODS
-from faintspot.engine.settings.plan import EnginePlan, SettingsPreparer
-from faintspot.engine.settings.running_settings import Change, RunningSettings
+from faintspot.engine.running_settings import Change, RunningSettings
 from faintspot.slopes.estimators import registry
 from faintspot.slopes.estimators.base import Estimator
 from faintspot.slopes.estimators.registry import faults_of, one_line

@@ -4,7 +4,7 @@ One process writes; any number of processes of the same user read. A camera neve
 using pixels, a reader checks with `PixelRing.intact` whether they were overwritten meanwhile. One reader, the
 engine, publishes its position (`PixelRing.follow`), so that a writer that can wait loses no frame.
 
-The cells of the segment (see `faintspot.engine.pixels.segment`) are: closed, arriving frame, its complete
+The cells of the segment (see `faintspot.engine.segment`) are: closed, arriving frame, its complete
 rows, arrivals (frames begun so far), then one for each slot with the frame number (-1 while it is replaced),
 arrival and time of the last row. Frame n lies in slot n % slots.
 
@@ -25,7 +25,7 @@ from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from faintspot.base.checks import number_between, numbers_between
 from faintspot.base.errors import InputError
-from faintspot.engine.pixels.segment import (
+from faintspot.engine.segment import (
     CELL,
     FOLLOWED,
     FOLLOWER,

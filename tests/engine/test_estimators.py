@@ -15,9 +15,9 @@ from tests.refusals import refused
 
 import faintspot as fs
 from faintspot.cli.realtime import command
+from faintspot.engine.estimators import EstimatorTrial, load_estimators
 from faintspot.engine.request_handlers import commands_of
 from faintspot.engine.requests import ControlServer, socket_path
-from faintspot.engine.settings.estimators import EstimatorTrial, load_estimators
 from faintspot.slopes.estimators import estimators
 from faintspot.slopes.estimators.registry import restore
 

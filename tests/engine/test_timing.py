@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from faintspot.engine.path.timing import (
+from faintspot.engine.timing import (
     IN_TIME,
     OTHER,
     PAGE_FAULT,

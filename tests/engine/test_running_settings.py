@@ -10,7 +10,7 @@ from tests.refusals import refused
 
 import faintspot as fs
 from faintspot.base.errors import InputError
-from faintspot.engine.settings.running_settings import RunningSettings
+from faintspot.engine.running_settings import RunningSettings
 
 pytestmark = pytest.mark.slow
 
@@ -111,7 +111,7 @@ def test_an_unforeseen_fault_while_building_leaves_the_running_one() -> None:
 
 
 def test_history_is_bounded_and_keeps_the_latest(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("faintspot.engine.settings.running_settings.HISTORY_LENGTH", 3)
+    monkeypatch.setattr("faintspot.engine.running_settings.HISTORY_LENGTH", 3)
     live = RunningSettings(made, SETTINGS)
     changes = []
     for frame_number in range(5):

@@ -8,8 +8,8 @@ from tests.engine.bench import SETTINGS, Bench, make, simulated
 from tests.refusals import refused
 
 import faintspot as fs
+from faintspot.engine.interleaving import Interleaving, methods_after, short_names
 from faintspot.engine.request_handlers import commands_of
-from faintspot.engine.settings.interleaving import Interleaving, methods_after, short_names
 from faintspot.slopes.pipeline.settings import without_denoising
 
 pytestmark = pytest.mark.slow

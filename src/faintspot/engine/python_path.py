@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.errors import InputError
-from faintspot.engine.path.frame_path import FramePath, check_real_time
+from faintspot.engine.frame_path import FramePath, check_real_time
 from faintspot.slopes.estimators.base import Positions
 from faintspot.slopes.estimators.python import PythonPlan
 from faintspot.slopes.estimators.registry import one_line

@@ -6,8 +6,8 @@ import pytest
 from numpy.typing import NDArray
 
 import faintspot as fs
-from faintspot.engine.path.frame_path import FramePath, Progress
-from faintspot.engine.settings.plan import EVERY, DarkFollower, FluxFollower
+from faintspot.engine.frame_path import FramePath, Progress
+from faintspot.engine.plan import EVERY, DarkFollower, FluxFollower
 from faintspot.slopes.pipeline.light import MeanFlux
 
 LAYOUT = fs.Layout.grid((6, 6), pixels=10)

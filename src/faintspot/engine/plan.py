@@ -14,12 +14,12 @@ from numpy.typing import NDArray
 
 from faintspot.base.checks import number_between
 from faintspot.base.errors import InputError
-from faintspot.engine.path.frame_path import FramePath, Progress, check_real_time
-from faintspot.engine.path.python_path import PythonPath, call_within, tried
-from faintspot.engine.path.workers import SlopePrior, Workers
-from faintspot.engine.pixels.pixel_ring import ARRIVALS, ROWS, PixelRing
-from faintspot.engine.settings.interleaving import Interleaving
-from faintspot.engine.settings.running_settings import RunningSettings
+from faintspot.engine.frame_path import FramePath, Progress, check_real_time
+from faintspot.engine.interleaving import Interleaving
+from faintspot.engine.pixel_ring import ARRIVALS, ROWS, PixelRing
+from faintspot.engine.python_path import PythonPath, call_within, tried
+from faintspot.engine.running_settings import RunningSettings
+from faintspot.engine.workers import SlopePrior, Workers
 from faintspot.slopes.estimators.base import Estimator
 from faintspot.slopes.estimators.registry import estimator_named
 from faintspot.slopes.kernels.compiling import Direct, compiled_with

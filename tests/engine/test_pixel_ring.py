@@ -18,8 +18,8 @@ from tests.patience import LIMIT_S, wait_for
 from tests.refusals import refused
 
 from faintspot.base.errors import InputError
-from faintspot.engine.pixels.pixel_ring import ARRIVALS, FRAME, ROWS, PixelRing
-from faintspot.engine.pixels.segment import CLOSED, FOLDER
+from faintspot.engine.pixel_ring import ARRIVALS, FRAME, ROWS, PixelRing
+from faintspot.engine.segment import CLOSED, FOLDER
 
 pytestmark = [
     pytest.mark.slow,
@@ -252,7 +252,7 @@ def killed_writer(name: str) -> Iterator[None]:
     """Start a writer, wait for its first frame, kill it (-9) and leave it a zombie."""
     code = (
         "import time, numpy as np\n"
-        "from faintspot.engine.pixels.pixel_ring import PixelRing\n"
+        "from faintspot.engine.pixel_ring import PixelRing\n"
         f"ring = PixelRing.create({name!r}, {SHAPE}, np.float32)\n"
         f"ring.publish(np.full({SHAPE}, 9.0))\n"
         "time.sleep(100)\n"

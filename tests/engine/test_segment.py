@@ -8,8 +8,8 @@ import pytest
 from tests import refusals
 
 from faintspot.base.errors import InputError
-from faintspot.engine.pixels.pixel_ring import PixelRing
-from faintspot.engine.pixels.segment import FOLDER
+from faintspot.engine.pixel_ring import PixelRing
+from faintspot.engine.segment import FOLDER
 
 pytestmark = [pytest.mark.skipif(not FOLDER.is_dir(), reason="needs POSIX shared memory as Linux has it")]
 

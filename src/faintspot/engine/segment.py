@@ -9,7 +9,7 @@ Bytes from the start, of which everything but the first page begins at a page::
            first one is 1 when the writer has closed the segment
     then   the items of each ring
 
-A segment gets its name when it is complete. Nothing is locked: see `faintspot.engine.pixels.pixel_ring` and
+A segment gets its name when it is complete. Nothing is locked: see `faintspot.engine.pixel_ring` and
 `faintspot.engine.telemetry.ring` for the order in which items and cells are written.
 """
 
