@@ -34,8 +34,8 @@ OF_THE_PROGRAM = {
 
 OF_DATA = {
     "loop/control/identification/slope_spectra.py _table": 44,
-    "loop/simulation/engine_files.py _learnt": 4,
-    "loop/simulation/engine_files.py _telemetry": 1,
+    "loop/simulation/learning.py _learnt": 4,
+    "loop/simulation/learning.py _telemetry": 1,
     "loop/simulation/simulation.py _learnt_sodium": 4,
     "loop/simulation/simulation.py _typical_spots": 2,
     "loop/simulation/telescope.py _laser_source": 2,
