@@ -11,19 +11,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from faintspot.base.errors import InputError
+from faintspot.engine import plan
 from faintspot.engine.control_loop import CLOSED, OPEN, STATES, ControlLoop
 from faintspot.engine.estimators import EngineEstimators
 from faintspot.engine.frame_path import FramePath
 from faintspot.engine.interleaving import EVERY, FIRST_METHOD, METHODS, Interleaving
 from faintspot.engine.pixel_ring import PixelRing, living_ring
-from faintspot.engine.plan import (
-    DarkFollower,
-    EngineOptions,
-    EnginePlan,
-    FluxFollower,
-    FrameInput,
-    SettingsPreparer,
-)
 from faintspot.engine.running_settings import Change, RunningSettings
 from faintspot.engine.streams.slope_streams import SlopeStreams
 from faintspot.engine.telemetry.ring import TelemetryRing
@@ -79,13 +72,13 @@ class Engine:
         name: str,
         make_pipeline: Callable[[Settings], SlopePipeline],
         settings: Settings,
-        options: EngineOptions | None = None,
+        options: plan.EngineOptions | None = None,
         *,
         interleaving: Interleaving | None = None,
-        source: FrameInput | None = None,
+        source: plan.FrameInput | None = None,
         control: Control | None = None,
     ) -> None:
-        options = EngineOptions() if options is None else options
+        options = plan.EngineOptions() if options is None else options
         threads = options.threads
         self.name, self._images_every = name, options.images_every
         interleaving = Interleaving() if interleaving is None else interleaving
@@ -107,14 +100,14 @@ class Engine:
         """Closed in reverse order when the engine has run."""
         self._workers = Workers(threads - 1, options.cpus) if threads > 1 else None
         prior = None if control is None else SlopePrior(len(control.interaction) // 2)
-        self.preparer = SettingsPreparer(
+        self.preparer = plan.SettingsPreparer(
             make_pipeline, interleaving, self._workers, options.deadline_s, prior
         )
-        self.live: RunningSettings[EnginePlan] = RunningSettings(self.preparer.prepare, settings)
+        self.live: RunningSettings[plan.EnginePlan] = RunningSettings(self.preparer.prepare, settings)
         self.estimators = EngineEstimators(self.live, self.preparer)
         mean_flux = options.mean_flux
-        self._flux = None if mean_flux is None else FluxFollower(self.live, mean_flux)
-        self._dark = DarkFollower(self.live.running.pipelines[0])
+        self._flux = None if mean_flux is None else plan.FluxFollower(self.live, mean_flux)
+        self._dark = plan.DarkFollower(self.live.running.pipelines[0])
         layout = self.live.running.layout
         self._raw = np.zeros(layout.frame_shape, np.float32)
         if control is not None:

@@ -8,16 +8,9 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from faintspot.loop.control import integrator
 from faintspot.loop.control.base import CommandDelayLine, Controller, without_prior
 from faintspot.loop.control.configuration import Control
-from faintspot.loop.control.integrator import (
-    DISPLACEMENT,
-    FLUX,
-    FLUX_TIMES_DISPLACEMENT,
-    INVALID_PART,
-    MEAN_SQUARE,
-    displaced_flux,
-)
 from faintspot.loop.control.options import CONTROLLER
 from faintspot.slopes.kernels.compiling import Direct
 from faintspot.slopes.sensor.layout import Layout
@@ -66,9 +59,9 @@ class Guard:
     def watch(self, summary: Floats, commands: Floats, flux: NDArray[np.float32]) -> None:
         """Take a frame: the summary of `true_slopes`, the commands that acted in it, and its flux (n,)."""
         self._frames += 1
-        self._invalid += self._share * (summary.item(INVALID_PART) - self._invalid)
+        self._invalid += self._share * (summary.item(integrator.INVALID_PART) - self._invalid)
         most = self._largest_px**2 * max(2.0, _MOST_OF_A_FRAME / self._share)
-        self._square += self._share * (min(summary.item(MEAN_SQUARE), most) - self._square)
+        self._square += self._share * (min(summary.item(integrator.MEAN_SQUARE), most) - self._square)
         self._spots.take(commands, flux)
 
     def objection(self, summary: Floats, commands: Floats, flux: NDArray[np.float32], latest: Floats) -> str:
@@ -168,7 +161,7 @@ class LostSpots:
         self._columns = np.ascontiguousarray(interaction.T, np.float32)
         self._of_late, self._statistics = frames, np.zeros(3)
         self._work = tuple(np.zeros((1, side), np.float32) for side in self._columns.shape)
-        self._summarise = Direct(displaced_flux)
+        self._summarise = Direct(integrator.displaced_flux)
         self.forget()
         self.take(np.zeros(interaction.shape[1]), np.zeros(len(interaction) // 2, np.float32))  # compiles
         self.forget()
@@ -182,12 +175,12 @@ class LostSpots:
         """Take a frame: the commands that acted in it, and its flux (n,)."""
         self._summarise(commands, flux, self._columns, self._work, self._statistics)
         statistics = self._statistics
-        flux_e = statistics.item(FLUX)
+        flux_e = statistics.item(integrator.FLUX)
         self._frames += 1
         share = 1 / min(self._frames, _MEMORY * self._of_late)
         self._flux += share * (flux_e - self._flux)
-        self._displacement += share * (statistics.item(DISPLACEMENT) - self._displacement)
-        self._product += share * (statistics.item(FLUX_TIMES_DISPLACEMENT) - self._product)
+        self._displacement += share * (statistics.item(integrator.DISPLACEMENT) - self._displacement)
+        self._product += share * (statistics.item(integrator.FLUX_TIMES_DISPLACEMENT) - self._product)
         self._late += (flux_e - self._late) / min(self._frames, self._of_late)
         if self._frames >= _FIRST * self._of_late:
             self._largest = max(self._largest, self._late)

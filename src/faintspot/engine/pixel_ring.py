@@ -25,17 +25,7 @@ from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from faintspot.base.checks import number_between, numbers_between
 from faintspot.base.errors import InputError
-from faintspot.engine.segment import (
-    CELL,
-    FOLLOWED,
-    FOLLOWER,
-    FOLLOWER_START,
-    LOST,
-    Segment,
-    process_lives,
-    process_start,
-    up_to_pages,
-)
+from faintspot.engine import segment
 from faintspot.slopes.kernels.ordered import fence, load, store
 
 FRAME, ROWS, ARRIVALS, FIRST_SLOT = range(1, 5)
@@ -47,7 +37,7 @@ _DTYPES = ("u1", "u2", "u4", "i2", "i4", "f4", "f8")
 _LARGEST_SIDE = 1 << 16
 
 
-class PixelRing(Segment):
+class PixelRing(segment.Segment):
     """A ring of frames in shared memory, made by `create` (the writer) or `attach` (a reader).
 
     Attributes
@@ -143,16 +133,16 @@ class PixelRing(Segment):
         if number < 0:
             raise InputError(f"frame_number = {number}: expected a number of at least 0")
         slot = number % self.slots
-        header = (FIRST_SLOT + slot) * CELL
+        header = (FIRST_SLOT + slot) * segment.CELL
         arrival = self._look(ARRIVALS) + 1
         # The order is the protocol: the slot's old frame number is cleared first, the new one is set last.
         store(flat, header + SLOT_FRAME, -1)
         store(flat, header + SLOT_TIME, 0)
         store(flat, header + SLOT_ARRIVAL, arrival)
-        store(flat, ROWS * CELL, 0)
+        store(flat, ROWS * segment.CELL, 0)
         store(flat, header + SLOT_FRAME, number)
-        store(flat, FRAME * CELL, number)
-        store(flat, ARRIVALS * CELL, arrival)
+        store(flat, FRAME * segment.CELL, number)
+        store(flat, ARRIVALS * segment.CELL, arrival)
         fence()  # before its first pixel is overwritten
         view: NDArray[Any] = self.pixels[slot]
         return view
@@ -166,8 +156,8 @@ class PixelRing(Segment):
             )
         if rows == self.shape[0]:
             header = FIRST_SLOT + number % self.slots
-            store(self._flat, header * CELL + SLOT_TIME, time.monotonic_ns())
-        store(self._flat, ROWS * CELL, rows)
+            store(self._flat, header * segment.CELL + SLOT_TIME, time.monotonic_ns())
+        store(self._flat, ROWS * segment.CELL, rows)
 
     def end(self) -> None:
         """Mark the frame as complete."""
@@ -195,23 +185,23 @@ class PixelRing(Segment):
         This asks the operating system, as `stale` does.
         """
         arrivals, lost, pid, start = (load(self.follower, cell) for cell in range(len(self.follower)))
-        return (arrivals, lost) if pid and process_lives(pid, start) else None
+        return (arrivals, lost) if pid and segment.process_lives(pid, start) else None
 
     # ---- reader
 
     def follow(self, arrival: int, lost: int = 0) -> None:
         """Publish that this process has finished all frames up to an arrival and has lost `lost` of them."""
-        store(self.follower, LOST, lost)
-        store(self.follower, FOLLOWED, arrival)
+        store(self.follower, segment.LOST, lost)
+        store(self.follower, segment.FOLLOWED, arrival)
         if not self._follows:
             self._follows = True
-            store(self.follower, FOLLOWER_START, process_start(os.getpid()))
-            store(self.follower, FOLLOWER, os.getpid())
+            store(self.follower, segment.FOLLOWER_START, segment.process_start(os.getpid()))
+            store(self.follower, segment.FOLLOWER, os.getpid())
 
     def unfollow(self) -> None:
         """Publish that this process measures no more frames of this ring."""
         self._follows = False
-        store(self.follower, FOLLOWER, 0)
+        store(self.follower, segment.FOLLOWER, 0)
 
     @property
     def arrivals(self) -> int:
@@ -267,7 +257,7 @@ class PixelRing(Segment):
 def _slot_bytes(description: Mapping[str, Any]) -> int:
     """Return the bytes from one slot to the next, whole pages."""
     rows, columns = description["shape"]
-    return up_to_pages(rows * columns * np.dtype(description["dtype"]).itemsize)
+    return segment.up_to_pages(rows * columns * np.dtype(description["dtype"]).itemsize)
 
 
 def living_ring(name: str, shape: tuple[int, int]) -> tuple[PixelRing | None, str]:

@@ -18,17 +18,7 @@ from faintspot.base.report.texts import Texts
 from faintspot.experiments.methods import knows_the_spot, label_of, style_of
 from faintspot.experiments.night.page import night_sections
 from faintspot.experiments.night.protocol import NIGHT_STORE, Night, load_night
-from faintspot.experiments.paper.claims import (
-    baselines_section,
-    gains_section,
-    grouped,
-    guidance,
-    in_words,
-    paper_rows,
-    paper_section,
-    parameter_in_words,
-    verdicts,
-)
+from faintspot.experiments.paper import claims
 from faintspot.experiments.paper.figures import (
     axis_of_study,
     baselines_figure,
@@ -96,7 +86,7 @@ class _Group:
     @property
     def words(self) -> str:
         """Parameters that the cells share."""
-        named = [parameter_in_words(key, value) for key, value in self.common.items()]
+        named = [claims.parameter_in_words(key, value) for key, value in self.common.items()]
         return ", ".join(text for text in named if not text.startswith("no "))
 
 
@@ -124,9 +114,11 @@ def _groups(dataset: xarray.Dataset, axis: str, by: Sequence[str], *, speckled: 
     """Yield the groups of cells that differ in `axis`, within a panel, and in `by`, between panels."""
     common = [name for name in PARAMETERS if name not in (axis, *by)]
     done = dataset["done"].values & ((dataset["d_over_r0"].values > 0) == speckled)
-    for values, cells in grouped(dataset, np.flatnonzero(done).tolist(), common, axis).items():
-        parts = grouped(dataset, cells, by, axis)
-        panels = {in_words(by, key): part for key, part in parts.items() if len(part) >= _FEWEST_POINTS}
+    for values, cells in claims.grouped(dataset, np.flatnonzero(done).tolist(), common, axis).items():
+        parts = claims.grouped(dataset, cells, by, axis)
+        panels = {
+            claims.in_words(by, key): part for key, part in parts.items() if len(part) >= _FEWEST_POINTS
+        }
         if panels:
             yield _Group(dict(zip(common, values, strict=True)), panels)
 
@@ -353,16 +345,16 @@ def _of_estimators(dataset: xarray.Dataset) -> list[Section]:
     return [
         _TEXT.section("sections.findings", findings(dataset)),
         *_figure_sections(dataset),
-        baselines_section(dataset),
+        claims.baselines_section(dataset),
     ]
 
 
 def _of_claims(dataset: xarray.Dataset, night: Night | None) -> list[Section]:
     return [
-        paper_section(paper_rows(dataset, night), verdicts(dataset)),
-        _TEXT.section("sections.guidance", *guidance(dataset)),
-        baselines_section(dataset),
-        gains_section(dataset),
+        claims.paper_section(claims.paper_rows(dataset, night), claims.verdicts(dataset)),
+        _TEXT.section("sections.guidance", *claims.guidance(dataset)),
+        claims.baselines_section(dataset),
+        claims.gains_section(dataset),
         *_figure_sections(dataset),
         *([] if night is None else night_sections(night)),
     ]

@@ -18,16 +18,8 @@ from faintspot.base.report.texts import with_error
 from faintspot.base.statistics import DRAWS, FEWEST_PIECES, SEED, Estimate, of_draws, paired_mean
 from faintspot.experiments.methods import Choice, crossings
 from faintspot.loop.control.base import INTEGRATOR, KALMAN
+from faintspot.loop.simulation import methods
 from faintspot.loop.simulation.configuration import LoopConfiguration
-from faintspot.loop.simulation.methods import (
-    FILTER,
-    FOLLOWED,
-    PREDICTED,
-    PRIOR,
-    UNCORRECTED,
-    WEIGHTED,
-    Method,
-)
 from faintspot.loop.simulation.sections import CLOSED
 from faintspot.slopes.estimators.base import Need
 from faintspot.slopes.estimators.built_in.maximum_likelihood import MaximumAPosteriori
@@ -253,19 +245,19 @@ class Tunable:
         return Tunable((near,), (near,))
 
 
-def tuned_values(method: Method, configuration: LoopConfiguration) -> dict[str, Tunable]:
+def tuned_values(method: methods.Method, configuration: LoopConfiguration) -> dict[str, Tunable]:
     """Return what is tuned for a configuration's flux: the loop gain and options of the estimator."""
     estimator = method.estimator.for_scene(configuration.scene)
     declared = estimator.declared()
     options = {
         name: _wider(values, declared[name]) for name, values in estimator.tuned(configuration.scene).items()
     }
-    if PRIOR in declared:
+    if methods.PRIOR in declared:
         reach = configuration.position_range_px(predicted=method.is_predicted)
-        options[PRIOR] = [part * reach for part in _PRIORS]
+        options[methods.PRIOR] = [part * reach for part in _PRIORS]
     if method.control == KALMAN:
-        options.pop(PRIOR, None)  # the filter knows it
-    if FILTER in method.variants:
+        options.pop(methods.PRIOR, None)  # the filter knows it
+    if methods.FILTER in method.variants:
         options = {}  # the spots determine it
     tuned = {LOOP_GAIN: Tunable(_LOOP_GAINS, _FIRST_LOOP_GAINS)}
     if method.control != INTEGRATOR:
@@ -277,7 +269,9 @@ def tuned_values(method: Method, configuration: LoopConfiguration) -> dict[str, 
     return tuned
 
 
-def with_choice(method: Method, configuration: LoopConfiguration, choice: Choice | None = None) -> Method:
+def with_choice(
+    method: methods.Method, configuration: LoopConfiguration, choice: Choice | None = None
+) -> methods.Method:
     """Return a method with tuned values, for the configuration's own flux.
 
     Without a choice, options are automatic and the loop gain is the configuration's. The PSF of those that
@@ -295,7 +289,7 @@ def with_choice(method: Method, configuration: LoopConfiguration, choice: Choice
     gain, noise_scale = options.pop(LOOP_GAIN, None), float(options.pop(NOISE_SCALE, 1.0))
     estimator = method.estimator.for_scene(configuration.scene).replaced(options)
     laser, needs_psf = configuration.laser is not None, Need.PSF in estimator.required
-    if not laser and {FILTER, FOLLOWED} & set(method.variants):
+    if not laser and {methods.FILTER, methods.FOLLOWED} & set(method.variants):
         raise InputError(f"method = {method.name!r}: expected a configuration with a laser")
     reach = configuration.position_range_px() if laser and needs_psf else None
     psf = _flat_psf(configuration) if needs_psf and not laser else None
@@ -318,11 +312,11 @@ def default_methods(configuration: LoopConfiguration) -> list[str]:
     names = []
     for name, kind in estimators().items():
         names.append(name)
-        predicted = f"{name}+{PREDICTED}" if kind.takes_prior else name
+        predicted = f"{name}+{methods.PREDICTED}" if kind.takes_prior else name
         names += [predicted] if kind.takes_prior else []
-        names += [f"{predicted}+{WEIGHTED}"] if Need.READ_NOISE in kind.needs else []
+        names += [f"{predicted}+{methods.WEIGHTED}"] if Need.READ_NOISE in kind.needs else []
         if configuration.control.mode != CLOSED and not kind.needs:
-            names.append(f"{name}+{UNCORRECTED}")
+            names.append(f"{name}+{methods.UNCORRECTED}")
     kalman = [Window.name, MaximumAPosteriori.name] if configuration.control.mode == CLOSED else []
     return names + [f"{name}+{KALMAN}" for name in kalman]
 

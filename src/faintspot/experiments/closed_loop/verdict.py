@@ -9,14 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.errors import InputError
-from faintspot.base.report.page import (
-    POSITIONS,
-    FigureWithData,
-    Report,
-    Section,
-    Table,
-    configuration_section,
-)
+from faintspot.base.report import page
 from faintspot.base.report.plots import Line, Panel
 from faintspot.base.report.texts import Texts, plain_number, with_error, with_interval
 from faintspot.base.statistics import Estimate, paired_mean
@@ -41,7 +34,7 @@ from faintspot.slopes.estimators.registry import estimators
 _TEXT = Texts("faintspot.experiments")
 
 
-def strehl_table(result: MagnitudeResult) -> Table:
+def strehl_table(result: MagnitudeResult) -> page.Table:
     """Return the Strehl ratio of every method at each flux."""
     rows = [
         [label, *(with_error(paired_mean(runs)) for runs in of_method)]
@@ -50,7 +43,7 @@ def strehl_table(result: MagnitudeResult) -> Table:
     return _TEXT.table("tables.strehl", rows, _stars(result))
 
 
-def settings_table(result: MagnitudeResult) -> Table:
+def settings_table(result: MagnitudeResult) -> page.Table:
     """Return the tuned loop gain and settings of every method at each flux."""
     rows = [
         [label, *map(_settings_words, choices, settings)]
@@ -59,7 +52,7 @@ def settings_table(result: MagnitudeResult) -> Table:
     return _TEXT.table("tables.settings", rows, _stars(result))
 
 
-def in_columns(table: Table) -> str:
+def in_columns(table: page.Table) -> str:
     """Return a table of texts as lines for a terminal."""
     rows = [[str(cell) for cell in row] for row in (table.header, *table.rows)]
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
@@ -250,7 +243,7 @@ _DODGE = 0.008  # of the axis, between methods at the same magnitude
 _LEARNING_LINE = (0, (6, 1.5, 1, 1.5))
 
 
-def loop_page(result: MagnitudeResult) -> Report:
+def loop_page(result: MagnitudeResult) -> page.Report:
     """Return the report page of closed-loop results."""
     configuration = _configuration(result.configuration)
     wavelength_um = 1.65 if configuration is None else configuration.science.wavelength_m * 1e6
@@ -258,10 +251,10 @@ def loop_page(result: MagnitudeResult) -> Report:
     sections = [
         _TEXT.section("verdict", *loop_verdict(result)),
         *_of_magnitudes(result, f"Strehl ratio at {wavelength_um:.3g} µm"),
-        configuration_section(result.configuration),
+        page.configuration_section(result.configuration),
     ]
     facts = {} if configuration is None else _facts(configuration)
-    return Report(f"Closed loop{name}", facts, sections, loop_warnings(result), remark=POSITIONS)
+    return page.Report(f"Closed loop{name}", facts, sections, loop_warnings(result), remark=page.POSITIONS)
 
 
 def loop_warnings(result: MagnitudeResult) -> list[str]:
@@ -276,7 +269,7 @@ def loop_warnings(result: MagnitudeResult) -> list[str]:
     )
 
 
-def _of_magnitudes(result: MagnitudeResult, strehl: str) -> list[Section]:
+def _of_magnitudes(result: MagnitudeResult, strehl: str) -> list[page.Section]:
     """Return the sections of Strehl against magnitude; `strehl` is the label of an axis."""
     references = reference_methods(result)
     figure = magnitude_figure(result, references[0], strehl)
@@ -287,7 +280,7 @@ def _of_magnitudes(result: MagnitudeResult, strehl: str) -> list[Section]:
     ]
 
 
-def magnitude_figure(result: MagnitudeResult, reference: int, label: str) -> FigureWithData:
+def magnitude_figure(result: MagnitudeResult, reference: int, label: str) -> page.FigureWithData:
     """Draw Strehl against magnitude for every method, and its difference from the reference."""
     shift = _DODGE * float(np.ptp(result.magnitudes) or 1.0)
     strehls, differences = [], []

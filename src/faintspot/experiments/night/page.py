@@ -13,14 +13,7 @@ from numpy.typing import NDArray
 
 from faintspot.base.errors import InputError
 from faintspot.base.files import write_atomically
-from faintspot.base.report.page import (
-    FigureWithData,
-    Report,
-    Section,
-    Table,
-    TableCell,
-    configuration_section,
-)
+from faintspot.base.report import page
 from faintspot.base.report.plots import FLUX_GREY, METHOD_COLOURS, WIDTH, Line, Panel
 from faintspot.base.report.texts import Texts, with_error
 from faintspot.base.statistics import Estimate
@@ -57,7 +50,7 @@ _MARKERS = "Dv<>P"
 _POINT: dict[str, object] = {"ls": "", "ms": 5, "elinewidth": 0.7, "alpha": 0.85}
 
 
-def panels_figure(night: Night) -> FigureWithData:
+def panels_figure(night: Night) -> page.FigureWithData:
     """Draw Strehl ratio against time, measured r0 and strength, with errors."""
     label, shown = f"Strehl ratio at {night.wavelength_m * 1e6:.3g} µm", _shown(night)
     lowest = float(np.nanmin(night.strehl - np.nan_to_num(night.strehl_error)))
@@ -259,7 +252,7 @@ def night_summary_text(night: Night) -> str:
     return "\n".join([*judged, *paper_sentences(night), *_conclusions(night)])
 
 
-def night_sections(night: Night) -> list[Section]:
+def night_sections(night: Night) -> list[page.Section]:
     """Return the sections of a night, for a page of its own or another one."""
     names = {"reference": night.labels[night.reference]}
     statements = _TEXT.table("night-verdicts", verdicts(night))
@@ -281,14 +274,14 @@ def night_sections(night: Night) -> list[Section]:
     ]
 
 
-def night_page(night: Night) -> Report:
+def night_page(night: Night) -> page.Report:
     """Return the page of a night."""
     configuration = _configuration(night)
     name = "" if configuration is None else f": “{configuration.name}”"
     sections = night_sections(night)
     if night.configuration:
-        sections.append(configuration_section(night.configuration))
-    return Report(_TEXT("page.title", name=name), _facts(night), sections)
+        sections.append(page.configuration_section(night.configuration))
+    return page.Report(_TEXT("page.title", name=name), _facts(night), sections)
 
 
 def _conclusions(night: Night) -> list[str]:
@@ -313,14 +306,14 @@ def _compared(night: Night) -> dict[str, Any]:
     return reference | {group.name: group.rows for group in groups(night)}
 
 
-def _means_table(night: Night) -> Table:
+def _means_table(night: Night) -> page.Table:
     named = _compared(night)
     columns = [group_means(night, rows) for rows in named.values()]
-    rows: list[list[str | TableCell]] = []
+    rows: list[list[str | page.TableCell]] = []
     for row, where in enumerate([*night.set_names, "all sets"]):
         values = [dict(zip(_MEAN, column[row], strict=True)) for column in columns]
         texts = [(_TEXT("night-means.cell", each), _TEXT("night-means.small", each)) for each in values]
-        rows.append([where, *(TableCell(text, small=small) for text, small in texts)])
+        rows.append([where, *(page.TableCell(text, small=small) for text, small in texts)])
     return _TEXT.table("night-means", rows, list(named))
 
 
@@ -334,7 +327,7 @@ def paper_sentences(night: Night) -> list[str]:
     return _TEXT.lines("night-paper.sentences", compared, **correlation)
 
 
-def paper_table(night: Night) -> Table | None:
+def paper_table(night: Night) -> page.Table | None:
     """Return the paper's Table 1 beside the means of a night, and the differences of both."""
     compared = compare_with_paper(night)
     if compared is None:

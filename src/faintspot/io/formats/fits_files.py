@@ -20,6 +20,7 @@ from faintspot.base.errors import InputError, load_fits
 from faintspot.base.files import check_bytes
 from faintspot.base.flags import VARIABLES
 from faintspot.base.text_files import parse_json, to_json
+from faintspot.io import fits_units
 from faintspot.io.file_format import (
     COORDINATE_UNITS,
     REQUIRED,
@@ -30,20 +31,6 @@ from faintspot.io.file_format import (
     unit_of,
     with_absent,
 )
-from faintspot.io.fits_units import (
-    AOT_VERSION,
-    GZIP_SIGNATURE,
-    Column,
-    ColumnValues,
-    HeaderDataUnit,
-    StreamedArray,
-    check_present,
-    columns_of,
-    is_gzip,
-    is_table,
-    open_plain_or_gzip,
-    units_of,
-)
 from faintspot.io.stored_array import StoredArray, one_line
 
 _BLOCK_BYTES, _PIECE_BYTES = 2880, 1 << 20
@@ -53,7 +40,7 @@ class Fits(FileFormat):
     """Frames in an image; slopes with each quantity in an image extension of its name, with checksums."""
 
     name = "FITS"
-    signatures: tuple[bytes, ...] = (b"SIMPLE", GZIP_SIGNATURE)
+    signatures: tuple[bytes, ...] = (b"SIMPLE", fits_units.GZIP_SIGNATURE)
     endings: tuple[str, ...] = (".fits",)
 
     def find(self, path: Path, key: str | None) -> StoredArray:
@@ -62,10 +49,12 @@ class Fits(FileFormat):
         `key` may also name a column of a binary table, (rows, ...). For a file of the AOT standard, return
         the frames of the sensor `key`, by default of the only one.
         """
-        if AOT_VERSION in next(units_of(path)).header:
+        if fits_units.AOT_VERSION in next(fits_units.units_of(path)).header:
             from faintspot.io.aot_reading import frames_of_aot
 
-            names = {name for unit in units_of(path) for name in (unit.name.upper(), str(unit.index))}
+            names = {
+                name for unit in fits_units.units_of(path) for name in (unit.name.upper(), str(unit.index))
+            }
             if key is None or key.strip().upper() not in names:
                 key = frames_of_aot(path, key)
         name = f"{path}:{key}" if key is not None else str(path)
@@ -74,7 +63,7 @@ class Fits(FileFormat):
 
     def names(self, path: Path) -> list[str]:
         """Return the names of images and of columns of numbers."""
-        return [name for unit in units_of(path) for name in (_columns(path, unit) or _name(unit))]
+        return [name for unit in fits_units.units_of(path) for name in (_columns(path, unit) or _name(unit))]
 
     def require(self) -> None:
         """Raise MissingExtraError when astropy is not installed."""
@@ -104,12 +93,12 @@ class Fits(FileFormat):
 
     def read(self, path: Path) -> StoredSlopes:
         """Read a file of slopes and verify its checksums."""
-        units = {unit.name.lower(): unit for unit in units_of(path)}
+        units = {unit.name.lower(): unit for unit in fits_units.units_of(path)}
         total = sum(unit.value_bytes for unit in units.values())
         check_bytes(path, total, most_slopes_bytes(), "slopes")
         check_stated(path, {name: units[name].shape for name in VARIABLES if name in units})
         fits = load_fits()
-        with warnings.catch_warnings(), open_plain_or_gzip(path) as stream:
+        with warnings.catch_warnings(), fits_units.open_plain_or_gzip(path) as stream:
             warnings.simplefilter("error")  # astropy only warns of truncated files and wrong checksums
             with fits.open(stream, memmap=False, checksum=True) as opened:
                 arrays = {unit.name.lower(): unit.data for unit in opened if unit.data is not None}
@@ -126,7 +115,9 @@ class Fits(FileFormat):
 
     def has_slopes(self, path: Path) -> bool:
         """Return whether the extensions have the names of slopes."""
-        return {name.upper() for name in (*REQUIRED, "attributes")} <= {unit.name for unit in units_of(path)}
+        return {name.upper() for name in (*REQUIRED, "attributes")} <= {
+            unit.name for unit in fits_units.units_of(path)
+        }
 
 
 class FitsGz(Fits):
@@ -141,24 +132,24 @@ class FitsGz(Fits):
             super().write(cast(IO[bytes], compressed), slopes)
 
 
-def _name(unit: HeaderDataUnit) -> list[str]:
+def _name(unit: fits_units.HeaderDataUnit) -> list[str]:
     return [unit.name] if unit.shape else []
 
 
-def _columns(path: Path, unit: HeaderDataUnit) -> dict[str, Column]:
+def _columns(path: Path, unit: fits_units.HeaderDataUnit) -> dict[str, fits_units.Column]:
     """Return the columns of a binary table; of another unit none."""
-    if not is_table(unit):
+    if not fits_units.is_table(unit):
         return {}
     try:
-        return columns_of(unit)
+        return fits_units.columns_of(unit)
     except Exception as error:  # cards are parsed on access and may be broken
         raise InputError(f"{path}: table {unit.name} is damaged ({one_line(error)})") from None
 
 
-def _find_unit(path: Path, key: str | None) -> tuple[HeaderDataUnit, Column | None]:
+def _find_unit(path: Path, key: str | None) -> tuple[fits_units.HeaderDataUnit, fits_units.Column | None]:
     """Return the first image, or the image, or table and column, named `key`."""
     names, wanted = [], "" if key is None else key.strip().upper()
-    for unit in units_of(path):
+    for unit in fits_units.units_of(path):
         columns = _columns(path, unit)
         listed = f" (a binary table; name a column, as {path.name}:COLUMN: {', '.join(columns)})"
         names.append(unit.name + (listed if columns else ""))
@@ -176,28 +167,28 @@ def _find_unit(path: Path, key: str | None) -> tuple[HeaderDataUnit, Column | No
     raise InputError(f"{path}: expected {sought}, the file has only: {', '.join(names)}")
 
 
-def _column(name: str, path: Path, unit: HeaderDataUnit, column: Column) -> StoredArray:
+def _column(name: str, path: Path, unit: fits_units.HeaderDataUnit, column: fits_units.Column) -> StoredArray:
     """Return a column of a binary table."""
-    compressed = is_gzip(path)
+    compressed = fits_units.is_gzip(path)
     if not compressed:
-        check_present(name, path, unit.data_start + unit.header.data_size)
+        fits_units.check_present(name, path, unit.data_start + unit.header.data_size)
     values = _Image(name, column.cards, column.stored_type)
 
     def open_array(files: ExitStack) -> Any:
-        stream = files.enter_context(open_plain_or_gzip(path))
-        rows = StreamedArray(stream, unit.data_start, column.rows, (column.length,))
-        values.stored = ColumnValues(rows, column.rows.itemsize)
+        stream = files.enter_context(fits_units.open_plain_or_gzip(path))
+        rows = fits_units.StreamedArray(stream, unit.data_start, column.rows, (column.length,))
+        values.stored = fits_units.ColumnValues(rows, column.rows.itemsize)
         return values
 
     return StoredArray(name, column.shape, values[:].dtype, open_array)
 
 
-def _image(name: str, path: Path, unit: HeaderDataUnit) -> StoredArray:
+def _image(name: str, path: Path, unit: fits_units.HeaderDataUnit) -> StoredArray:
     """Return the image of a unit: of plain bytes, or decompressed tile by tile by astropy."""
     fits = load_fits()
-    compressed_file = is_gzip(path)
+    compressed_file = fits_units.is_gzip(path)
     if not compressed_file:
-        check_present(name, path, unit.data_start + unit.header.data_size)
+        fits_units.check_present(name, path, unit.data_start + unit.header.data_size)
     unit.check_tiles(name, path)
     bits = unit.header["ZBITPIX" if unit.compressed else "BITPIX"]
     if bits not in fits.BITPIX2DTYPE:
@@ -206,13 +197,15 @@ def _image(name: str, path: Path, unit: HeaderDataUnit) -> StoredArray:
     image = _Image(name, unit.header, stored_type)
 
     def open_array(files: ExitStack) -> Any:
-        stream = files.enter_context(open_plain_or_gzip(path))
+        stream = files.enter_context(fits_units.open_plain_or_gzip(path))
         if unit.compressed:
             units = fits.open(stream, memmap=False, do_not_scale_image_data=True)
             image.stored = files.enter_context(units)[unit.index].section
         else:
             numbers, start = stored_type.newbyteorder(">"), unit.data_start
-            image.stored = StreamedArray(stream, start, numbers, unit.shape, compressed=compressed_file)
+            image.stored = fits_units.StreamedArray(
+                stream, start, numbers, unit.shape, compressed=compressed_file
+            )
         return image
 
     return StoredArray(name, unit.shape, image[:].dtype, open_array, chunks=unit.tile)

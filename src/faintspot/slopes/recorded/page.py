@@ -18,21 +18,8 @@ from faintspot.base.statistics import Estimate
 from faintspot.slopes.estimators.base import Step
 from faintspot.slopes.estimators.built_in.total_variation import TotalVariation
 from faintspot.slopes.pipeline.slopes import Stages
-from faintspot.slopes.recorded import pictures
+from faintspot.slopes.recorded import pictures, statistics
 from faintspot.slopes.recorded.pictures import Followed
-from faintspot.slopes.recorded.statistics import (
-    Floats,
-    Jitter,
-    MeasuredSlopes,
-    SlopesSummary,
-    frame_to_frame_noise,
-    jitter,
-    median,
-    relative_gain,
-    slope_error,
-    summarise,
-    valid_in_all,
-)
 from faintspot.slopes.sensor.layout import Layout
 from faintspot.slopes.wavefront import certify, fit_wavefront
 from faintspot.slopes.wavefront.figure import wavefront_figure
@@ -48,24 +35,28 @@ _SURELY = 3.0  # standard errors
 class NoiseComparison:
     """Noise and centroid gain of the methods of a run, from the slopes alone."""
 
-    methods: Sequence[MeasuredSlopes]
-    noise_px: Sequence[Floats]
+    methods: Sequence[statistics.MeasuredSlopes]
+    noise_px: Sequence[statistics.Floats]
     """Noise of each sub-aperture from consecutive frames; NaN where there are none."""
     gains: Sequence[tuple[float, float]]
     """Centroid gain relative to the last method, and its standard error; NaN where it is not known."""
 
     @classmethod
-    def of(cls, methods: Sequence[MeasuredSlopes], valid: Sequence[NDArray[np.bool_]]) -> NoiseComparison:
+    def of(
+        cls, methods: Sequence[statistics.MeasuredSlopes], valid: Sequence[NDArray[np.bool_]]
+    ) -> NoiseComparison:
         """Measure the methods, each over its valid measurements; gains only where the frames are the same."""
-        noise = [frame_to_frame_noise(method, used) for method, used in zip(methods, valid, strict=True)]
+        noise = [
+            statistics.frame_to_frame_noise(method, used) for method, used in zip(methods, valid, strict=True)
+        ]
         last, unknown = methods[-1], (np.nan, np.nan)
         same = len(methods) > 1 and all(np.array_equal(method.number, last.number) for method in methods)
-        gains = [relative_gain(method, last, valid[-1]) if same else unknown for method in methods]
+        gains = [statistics.relative_gain(method, last, valid[-1]) if same else unknown for method in methods]
         return cls(methods, noise, [gain if gain[1] < _KNOWN else unknown for gain in gains])
 
-    def equal_noise(self, index: int) -> Floats:
+    def equal_noise(self, index: int) -> statistics.Floats:
         """Return the noise of a method at the gain of the last one, px."""
-        equal: Floats = self.noise_px[index] / self.gains[index][0]
+        equal: statistics.Floats = self.noise_px[index] / self.gains[index][0]
         return equal
 
     def warnings(self) -> list[str]:
@@ -80,7 +71,7 @@ class NoiseComparison:
 
     def verdict(self) -> str:
         """Name the method with the least noise at equal gain, if the errors allow it."""
-        levels = [median(self.equal_noise(index)) for index in range(len(self.methods))]
+        levels = [statistics.median(self.equal_noise(index)) for index in range(len(self.methods))]
         if len(levels) < 2 or self.methods[0].n_frames < 2:
             return ""
         if not np.isfinite(levels).all():
@@ -127,7 +118,7 @@ class SlopesRun:
         When the parts do not fit together.
     """
 
-    methods: Sequence[MeasuredSlopes]
+    methods: Sequence[statistics.MeasuredSlopes]
     layout: Layout | None
     stages: Mapping[str, Stages] = field(default_factory=dict)
     truth: ArrayLike | None = None
@@ -160,7 +151,7 @@ class SlopesRun:
         return self.methods[0].n_frames > 1
 
     @property
-    def true_positions(self) -> Floats | None:
+    def true_positions(self) -> statistics.Floats | None:
         """The truth, where it is known."""
         return None if self.truth is None else np.asarray(self.truth)
 
@@ -169,19 +160,19 @@ class SlopesRun:
         """Compared measurements of each method: those valid in every method of the same frames."""
         first = self.methods[0]
         if all(np.array_equal(method.number, first.number) for method in self.methods):
-            return [valid_in_all(self.methods)] * len(self.methods)
+            return [statistics.valid_in_all(self.methods)] * len(self.methods)
         return [method.valid for method in self.methods]
 
     @cached_property
-    def summaries(self) -> list[SlopesSummary]:
+    def summaries(self) -> list[statistics.SlopesSummary]:
         """Numbers of each method."""
-        return [summarise(method) for method in self.methods]
+        return [statistics.summarise(method) for method in self.methods]
 
     @cached_property
-    def jitters(self) -> list[Jitter]:
+    def jitters(self) -> list[statistics.Jitter]:
         """Jitter of each method."""
         pairs = zip(self.methods, self.valid, strict=True)
-        return [jitter(method.x, method.y, valid) for method, valid in pairs]
+        return [statistics.jitter(method.x, method.y, valid) for method, valid in pairs]
 
     @cached_property
     def comparison(self) -> NoiseComparison:
@@ -258,7 +249,7 @@ def warnings_in_words(run: SlopesRun) -> list[str]:
     return lines
 
 
-def _of_method(method: MeasuredSlopes, summary: SlopesSummary) -> list[str]:
+def _of_method(method: statistics.MeasuredSlopes, summary: statistics.SlopesSummary) -> list[str]:
     lines = [] if summary.valid_fraction else [_TEXT["warnings.none_valid"]]
     for flag, (most, advice) in _TEXT["advice"].items():
         fraction = method.flag_count(SubapertureFlag[flag]) / method.x.size
@@ -295,10 +286,10 @@ def _key_numbers(run: SlopesRun) -> Section:
 def _record(run: SlopesRun, index: int) -> dict[str, object]:
     """Return the numbers of a method; None where they say nothing."""
     method, comparison, truth = run.methods[index], run.comparison, run.true_positions
-    noise, relative = median(comparison.noise_px[index]), Estimate(*comparison.gains[index])
+    noise, relative = statistics.median(comparison.noise_px[index]), Estimate(*comparison.gains[index])
     error = gain = None
     if truth is not None:
-        error, gain = slope_error(method, truth, run.valid[-1])
+        error, gain = statistics.slope_error(method, truth, run.valid[-1])
     ranked = truth is None and bool(np.isfinite([gain for gain, _ in comparison.gains[:-1]]).any())
     is_last = relative.standard_error == 0
     scale = None if run.layout is None else run.layout.pixel_scale_arcsec
@@ -309,10 +300,10 @@ def _record(run: SlopesRun, index: int) -> dict[str, object]:
         "noise": noise,
         "noise_arcsec": None if scale is None else noise * scale,
         "is_last": ranked and is_last,
-        "relative_gain": relative if ranked and not is_last else None,
-        "noise_at_equal_gain": median(comparison.equal_noise(index)) if ranked else None,
+        "statistics.relative_gain": relative if ranked and not is_last else None,
+        "noise_at_equal_gain": statistics.median(comparison.equal_noise(index)) if ranked else None,
         "stated_error": method.standard_error_px,
-        "jitter": median(run.jitters[index].px),
+        "statistics.jitter": statistics.median(run.jitters[index].px),
         "summary": run.summaries[index],
     }
 

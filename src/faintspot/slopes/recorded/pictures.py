@@ -9,17 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from faintspot.base.report import plots
 from faintspot.base.report.page import FigureWithData
-from faintspot.base.report.plots import (
-    GREY,
-    METHOD_COLOURS,
-    TRUTH_COLOUR,
-    WIDTH,
-    Line,
-    Mark,
-    Picture,
-    limits_of,
-)
 from faintspot.base.report.texts import Texts, plain_number
 from faintspot.slopes.estimators.base import Step
 from faintspot.slopes.estimators.built_in.total_variation import TotalVariation
@@ -89,13 +80,13 @@ def sensor_figure(example: Example, frame: int) -> FigureWithData:
     """Draw all windows of the calibrated frame at their places, with the positions of the spots."""
     layout, images = example.layout, example.first.calibrated
     sheet, start = assembled(layout, images), layout.corners.min(axis=0) - 0.5
-    (low, high), (n_rows, n_columns) = limits_of(images, percent=99.8), sheet.shape
+    (low, high), (n_rows, n_columns) = plots.limits_of(images, percent=99.8), sheet.shape
     extent = start[1], start[1] + n_columns, start[0], start[0] + n_rows
     middles = layout.corners[:, ::-1] + 0.5 * (np.array(layout.window[::-1]) - 1)
     few = len(layout) <= _MOST_MARKED
     marks = _crosses({name: xy + middles for name, xy in example.positions().items()}, 6) if few else []
     style = {"vmin": low, "vmax": high, "extent": extent}
-    picture, width = Picture(sheet, "e- per pixel", style=style, marks=marks), 0.62 * WIDTH
+    picture, width = plots.Picture(sheet, "e- per pixel", style=style, marks=marks), 0.62 * plots.WIDTH
     values = {
         "frame": frame,
         "marked": few,
@@ -110,21 +101,21 @@ def steps_figure(example: Example) -> FigureWithData:
     stages, steps, chosen = example.first, example.shown_steps, example_subapertures(example.first)
     height, width = example.layout.window
     style: dict[str, Any] = {"extent": (-width / 2, width / 2, -height / 2, height / 2)}
-    positions, rows = example.positions(), list[list[Picture]]()
+    positions, rows = example.positions(), list[list[plots.Picture]]()
     for which, index in chosen.items():
-        limits = limits_of(stages.calibrated[index], percent=99.8)
+        limits = plots.limits_of(stages.calibrated[index], percent=99.8)
         crosses = _crosses({name: xy[index : index + 1] for name, xy in positions.items()}, 13)
         y = f"{which}\nno. {index}, {plain_number(float(stages.slopes.flux[index]))} e-\ny (px)"
-        row = list[Picture]()
+        row = list[plots.Picture]()
         for title, step in steps.items():
             image, is_raw = getattr(stages, step)[index], step == "raw"
-            low, high = limits_of(image, percent=99.8) if is_raw else limits
+            low, high = plots.limits_of(image, percent=99.8) if is_raw else limits
             unit = "ADU" if is_raw else "e- per pixel" if title == list(steps)[-1] else ""
             options = {**style, "vmin": low, "vmax": high}
             above, marks = "" if rows else title, [] if is_raw else crosses
-            row.append(Picture(image, unit, above, "x (px)", "" if row else y, options, marks))
+            row.append(plots.Picture(image, unit, above, "x (px)", "" if row else y, options, marks))
         rows.append(row)
-    panel = WIDTH / 5.3
+    panel = plots.WIDTH / 5.3
     size = len(rows) * (panel * min(height / width, 2.0) + 0.4) + 0.9
     values, options = {"shown": next(iter(example.stages))}, {"width": panel * (len(steps) + 1.3), **_ABOVE}
     return _TEXT.figure("subapertures", rows, size, values, shared=True, **options)
@@ -154,13 +145,13 @@ def assembled(layout: Layout, images: NDArray[np.generic]) -> Floats:
     return sheet
 
 
-def _crosses(positions: Mapping[str, Floats], size: float) -> list[Line]:
+def _crosses(positions: Mapping[str, Floats], size: float) -> list[plots.Line]:
     """Return marks: crosses for each method, the first one's on top, and circles for the truth."""
     from matplotlib.patheffects import withStroke
 
     width = 0.5 + 0.08 * size
     around = [withStroke(linewidth=2.6 * width, foreground="black")]
-    circle = {"marker": "o", "ms": 1.5 * size, "mfc": "none", "mec": TRUTH_COLOUR}
+    circle = {"marker": "o", "ms": 1.5 * size, "mfc": "none", "mec": plots.TRUTH_COLOUR}
     crosses = iter(_MARKS)
     lines = []
     for order, (name, xy) in enumerate(positions.items()):
@@ -174,7 +165,7 @@ def _crosses(positions: Mapping[str, Floats], size: float) -> list[Line]:
                 "path_effects": around,
                 "zorder": 3 - 0.1 * order,
             }
-        lines.append(Line.of(name, xy, {"ls": "", "mew": width, **style}))
+        lines.append(plots.Line.of(name, xy, {"ls": "", "mew": width, **style}))
     return lines
 
 
@@ -224,11 +215,11 @@ def followed_figure(followed: Followed, layout: Layout) -> FigureWithData:
     valid, doubtful = slopes.valid[number], slopes.measured[number] & ~slopes.valid[number]
     arrows = {"color": _VALID, "label": "valid spot", "scale": 1.0, "width": 0.004, "zorder": 3}
     circle = {"ls": "", "marker": "o", "mfc": "none", "color": _INVALID}
-    marks: list[Mark] = [
-        *(Line.of("path over all frames", xy, path) for xy in paths),
-        Line.of("reference", nodes, cross),
+    marks: list[plots.Mark] = [
+        *(plots.Line.of("path over all frames", xy, path) for xy in paths),
+        plots.Line.of("reference", nodes, cross),
         Arrows(nodes[valid], (at[number] - nodes)[valid], arrows),
-        *([Line.of("crossing or doubtful", at[number][doubtful], circle)] if doubtful.any() else []),
+        *([plots.Line.of("crossing or doubtful", at[number][doubtful], circle)] if doubtful.any() else []),
     ]
     everything = np.concatenate([nodes, shown.reshape(-1, 2)])
     frame, margin = np.asarray(followed.frame, np.float64), 0.7 * max(layout.window)
@@ -236,8 +227,8 @@ def followed_figure(followed: Followed, layout: Layout) -> FigureWithData:
     right, high = np.minimum(np.nanmax(everything, axis=0) + margin, np.array(frame.shape[::-1]) - 0.5)
     style = {"cmap": "gray", "norm": asinh_stretch(frame, layout.images(frame))}
     limits: dict[str, Any] = {"x_range": (left, right), "y_range": (low, high)}
-    picture = Picture(frame, "frame's units", style=style, marks=marks, **limits)
-    height = min(0.9 * WIDTH * (high - low) / (right - left) + 0.5, 1.3 * WIDTH)
+    picture = plots.Picture(frame, "frame's units", style=style, marks=marks, **limits)
+    height = min(0.9 * plots.WIDTH * (high - low) / (right - left) + 0.5, 1.3 * plots.WIDTH)
     return _TEXT.figure("followed-frame", [[picture]], height, {"frame": number}, **_ABOVE)
 
 
@@ -249,8 +240,8 @@ def maps_figure(
 ) -> FigureWithData:
     """Draw flux, valid frames and jitter, a row of maps for each method; of one frame, flux only."""
     several = methods[0].n_frames > 1
-    flux_limits = limits_of(*(summary.flux_e for summary in summaries), low=0.0)
-    jitter_limits = limits_of(*(item.px for item in jitters), low=0.0)
+    flux_limits = plots.limits_of(*(summary.flux_e for summary in summaries), low=0.0)
+    jitter_limits = plots.limits_of(*(item.px for item in jitters), low=0.0)
     rows = []
     for method, summary, item in zip(methods, summaries, jitters, strict=True):
         name = f"{method.name}: {'median ' if several else ''}flux"
@@ -261,7 +252,7 @@ def maps_figure(
             row.append(Map(layout, item.px, "jitter (px)", "jitter", jitter_limits))
         rows.append(row)
     columns = len(rows[0])
-    width = WIDTH if several else 0.6 * WIDTH
+    width = plots.WIDTH if several else 0.6 * plots.WIDTH
     return _TEXT.figure(
         "flux", rows, len(rows) * map_height(layout, columns), {"several": several}, width=width
     )
@@ -278,13 +269,15 @@ def arrows_figure(
     pitch, several = layout.pitch_px or max(layout.window), methods[0].n_frames > 1
     length, width = (0.6, 0.004) if len(layout) <= _MOST_SHORT_ARROWS else (2.0, 0.0015)
     maps = []
-    for method, summary, colour in zip(methods, summaries, METHOD_COLOURS, strict=False):
+    for method, summary, colour in zip(methods, summaries, plots.METHOD_COLOURS, strict=False):
         slopes = np.stack([summary.x_px, summary.y_px], axis=-1)
         known, long = np.isfinite(summary.x_px), np.hypot(*slopes.T)
         shown = (slopes * np.minimum(1.0, longest / np.maximum(long, longest))[:, None])[known]
         colours = np.where(long > longest, "black", colour)[known]
         style = {"color": colours, "scale": longest / (length * pitch), "width": width}
-        cross = Line.of("", layout.centres[~known], {"ls": "", "marker": "x", "color": GREY, "ms": 5})
+        cross = plots.Line.of(
+            "", layout.centres[~known], {"ls": "", "marker": "x", "color": plots.GREY, "ms": 5}
+        )
         arrows = Arrows(layout.centres[known], shown, style, _round_length(longest))
         title = f"{method.name}: {'mean slope' if several else 'slope'}"
         maps.append(Map(layout, title=title, marks=[arrows, cross]))
@@ -294,7 +287,7 @@ def arrows_figure(
         "number": number or None,
         "several": several,
     }
-    figure_width = WIDTH if len(maps) > 1 else 0.6 * WIDTH
+    figure_width = plots.WIDTH if len(maps) > 1 else 0.6 * plots.WIDTH
     return _TEXT.figure("slopes", [maps], map_height(layout, len(maps)), values, width=figure_width)
 
 
