@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import os
 import sys
 from collections.abc import Callable, Iterator, Mapping
@@ -213,16 +212,8 @@ def load_zarr() -> Any:
     return _load("zarr", "zarr", "Reading or writing a Zarr store")
 
 
-def has_zarr() -> bool:
-    """Return whether zarr is installed."""
-    try:
-        return importlib.util.find_spec("zarr") is not None
-    except ImportError:  # an import hook that refuses it
-        return False
-
-
 def _load(module: str, package: str, purpose: str) -> Any:
     try:
-        return importlib.import_module(module)
+        return import_module(module)
     except ImportError:
         raise MissingExtraError(package, "io", purpose) from None

@@ -8,7 +8,7 @@ from typing import Any
 
 import click
 
-from faintspot.base.errors import InputError, MissingExtraError, has_zarr
+from faintspot.base.errors import InputError, MissingExtraError, present
 from faintspot.base.flags import SubapertureFlag
 from faintspot.base.tables import parse_changes
 from faintspot.cli.commands import KEY, NAMES, REFERENCE, configuration_option, option
@@ -130,7 +130,7 @@ def _check_format(output: str) -> None:
         slope_format(Path(output)).require()
     except MissingExtraError as error:
         raise InputError(f"{error}, or write NumPy's own format: -o {Path(output).stem}.npz") from None
-    if not has_zarr():
+    if not present("zarr"):
         click.echo(
             f"{output}: without zarr an interrupted run starts again; "
             "to resume it, install zarr with pip install 'faintspot[io]'",

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.checks import finite_array, number_between, one_of
-from faintspot.base.errors import InputError, MissingExtraError, errors_within, has_zarr
+from faintspot.base.errors import InputError, MissingExtraError, errors_within, present
 from faintspot.base.files import check_regular, output_errors
 from faintspot.base.flags import VARIABLES, leave_out, scaled_positions
 from faintspot.io.file_format import (
@@ -103,7 +103,7 @@ def create_writer(
         if measured_attributes is not None:
             more = json_values("attributes", measured_attributes())
             run = replace(run, attributes={**run.attributes, **more})
-        if not has_zarr() and not store_path.exists():
+        if not present("zarr") and not store_path.exists():
             check_memory(path, *run.sizes)
             return SlopeWriter(path, run, export=export)
         lock = OutputLock(path)

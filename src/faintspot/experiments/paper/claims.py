@@ -168,9 +168,6 @@ def _recommendation(best: list[_Compared]) -> str:
     return _TEXT("guidance.advice_for", **counts, count=len(use), listed="; ".join(listed))
 
 
-_STATISTICS = ("gain", "rms", "corrected_rms", "outlier_fraction", "photon_efficiency")
-
-
 def mode_in_words(mode: str) -> str:
     """Return "best k", "fixed k = 40", or "best gain-corrected rms"."""
     if mode == CORRECTED:
