@@ -105,11 +105,15 @@ class HcipyLoop(SteppedLoop):
         """See `SteppedLoop`."""
         np.random.seed(seed)  # noqa: NPY002 - HCIPy's detectors draw from this one
 
-    def frame(self, path_m: NDArray[np.float32], command: Floats) -> tuple[Floats, float]:
-        """See `SteppedLoop`."""
+    def _strehl(self, path_m: NDArray[np.float32], command: Floats) -> float:
+        """Send a command, and return the Strehl ratio behind the mirror."""
         system = self._example
         system.mirror.actuators = command
         residual = path_m + system.mirror.opd
         field = np.average(np.exp(2j * np.pi / IMAGING_M * residual), weights=system.pupil)
-        slopes = self._slopes(system.image(system.noisy, path_m, self._photons)) - self._flat
-        return slopes, float(np.abs(field) ** 2)
+        return float(np.abs(field) ** 2)
+
+    def frame(self, path_m: NDArray[np.float32], command: Floats) -> tuple[Floats, float]:
+        """See `SteppedLoop`."""
+        ratio, system = self._strehl(path_m, command), self._example
+        return self._slopes(system.image(system.noisy, path_m, self._photons)) - self._flat, ratio

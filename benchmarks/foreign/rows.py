@@ -44,10 +44,19 @@ def _changing(folder: Path, brightness: float) -> ForeignLoop:
     return ChangingLoop(replace(_FIRST, flux_e=_FIRST.flux_e * brightness), folder)
 
 
-def _pyramid(case: OopaoCase, folder: Path, brightness: float) -> ForeignLoop:
+def _pyramid(tool: str, case: OopaoCase, folder: Path, brightness: float) -> ForeignLoop:
+    case = replace(case, flux_e=case.flux_e * brightness)
+    if tool == "specula":
+        from benchmarks.foreign.specula_pyramid import SpeculaPyramidLoop
+
+        return SpeculaPyramidLoop(case, folder)
+    if tool == "hcipy":
+        from benchmarks.foreign.hcipy_pyramid import HcipyPyramidLoop
+
+        return HcipyPyramidLoop(case, folder)
     from benchmarks.foreign.oopao_pyramid import PyramidLoop
 
-    return PyramidLoop(replace(case, flux_e=case.flux_e * brightness), folder)
+    return PyramidLoop(case, folder)
 
 
 def _specula(flux_e: float, own_slopes: bool, folder: Path, brightness: float) -> ForeignLoop:
@@ -69,7 +78,16 @@ def _soapy(folder: Path, brightness: float) -> ForeignLoop:
 
 
 _FIRST = OopaoCase("first")
-_PYRAMID = OopaoCase("bright", flux_e=1e5, read_noise_e=0.5)
+_BRIGHT = OopaoCase("bright", flux_e=1e5, read_noise_e=0.5)
+_PYRAMIDS = (
+    ("", "100,000 e- a frame", _BRIGHT),
+    ("-faint", "300 e- a frame", replace(_BRIGHT, name="faint", flux_e=300.0)),
+    (
+        "-vibration",
+        "10,000 e- a frame, a tip of 45 Hz, 120 nm rms",
+        replace(_BRIGHT, name="vibration", flux_e=1e4, vibration_nm=120.0),
+    ),
+)
 _MOVED, _DEAD, _COLUMNS = (OopaoCase(fault, fault=fault) for fault in ("moved", "dead", "columns"))
 _LARGE = OopaoCase("large", lenslets=16, lenslet_px=6, diameter_m=8.0, rate_hz=500.0)
 ROWS = (
@@ -108,18 +126,12 @@ ROWS = (
         partial(_oopao, OopaoCase("vibration", vibration_nm=120.0, is_modal=True)),
         0.605,
     ),
-    Row("oopao-pyramid", "a pyramid, 100,000 e- a frame", partial(_pyramid, _PYRAMID)),
-    Row(
-        "oopao-pyramid-faint",
-        "a pyramid, 300 e- a frame",
-        partial(_pyramid, replace(_PYRAMID, name="faint", flux_e=300.0)),
-    ),
-    Row(
-        "oopao-pyramid-vibration",
-        "a pyramid, 10,000 e- a frame, a tip of 45 Hz, 120 nm rms",
-        partial(_pyramid, replace(_PYRAMID, name="vibration", flux_e=1e4, vibration_nm=120.0)),
-    ),
     Row("oopao-large", "8 m, 16 x 16, 500 Hz, r0 0.25 m, 20 e-, 3 e-", partial(_oopao, _LARGE)),
+    *(
+        Row(f"{tool}-pyramid{suffix}", f"a pyramid, {title}", partial(_pyramid, tool, case))
+        for tool in ("oopao", "specula", "hcipy")
+        for suffix, title, case in _PYRAMIDS
+    ),
 )
 
 

@@ -56,9 +56,7 @@ class SpeculaLoop(ForeignLoop):
             setup = self._example.Setup("window", **tables)
         calibration = {**self._example.INTERACTION, "slopec_override": {**setup.keys, **setup.calibrating}}
         found = self._example.run(self._example.SYSTEM, calibration)
-        matrix = np.asarray(found.objs["im_calibrator"].outputs["out_intmat"].get_value(), np.float64)
-        modes = self._example.MODES
-        self.interaction = matrix if matrix.shape[1] == modes else matrix.T
+        self.interaction = self._matrix(found)
         self.own = {}  # its Modalrec is the inverse, its Integrator the one that is compared
         subapertures = found.objs["slopec"].subapdata
         pixels, side = np.asarray(subapertures.idxs), int(subapertures.np_sub)
@@ -67,26 +65,28 @@ class SpeculaLoop(ForeignLoop):
         self.unit_arcsec = abs(tilt / np.median(self.interaction[: len(pixels), 0])) / ARCSEC
         self.r0_m = _SEEING_TO_R0 / (self._example.SEEING_ARCSEC * ARCSEC)
         self.cells = np.stack(np.divmod(pixels[:, 0], side * subapertures.nx), axis=1) // side
+        self._settings = {"slopec_override": setup.keys}
+        self._quantum_efficiency = flux_e * _QUANTUM_EFFICIENCY
+        self._system = self._called(self._example.SYSTEM)
+
+    def _called(self, system: dict[str, Any]) -> dict[str, Any]:
+        """Return a system with the winds, and with a control that is called."""
         speeds, directions = (list(values) for values in zip(*self.winds, strict=True))
         constant = self._example.constant
-        self._system: dict[str, Any] = {
-            **self._example.SYSTEM,
-            "wind_speed": constant(speeds),
-            "wind_direction": constant(directions),
-            "control": {
-                "class": "CalledControl",
-                "nmodes": modes,
-                "delay": 1,
-                "inputs": {"in_slopes": "slopec.out_slopes"},
-                "outputs": ["out_comm"],
-            },
+        control = {
+            "class": "CalledControl",
+            "nmodes": self._example.MODES,
+            "delay": 1,
+            "inputs": {"in_slopes": "slopec.out_slopes"},
+            "outputs": ["out_comm"],
         }
-        del self._system["rec"]
-        self._settings = {
-            "slopec_override": setup.keys,
-            "psf_override": {"start_time": SETTLE_FRAMES / self.rate_hz},
-        }
-        self._quantum_efficiency = flux_e * _QUANTUM_EFFICIENCY
+        own = {"wind_speed": constant(speeds), "wind_direction": constant(directions), "control": control}
+        return {name: part for name, part in (system | own).items() if name != "rec"}
+
+    def _matrix(self, ran: Any) -> Floats:
+        """Return the interaction matrix of a calibration."""
+        matrix = np.asarray(ran.objs["im_calibrator"].outputs["out_intmat"].get_value(), np.float64)
+        return matrix if matrix.shape[1] == self._example.MODES else matrix.T
 
     def run(self, control: Control, seed: int, frames: int, *, turned: bool = False) -> Observed:
         """See `ForeignLoop`; the Strehl ratio is that of the long exposure."""
@@ -106,6 +106,7 @@ class SpeculaLoop(ForeignLoop):
                 "readout_seed": seed + 2000,
                 "quantum_eff": self._quantum_efficiency,
             },
+            "psf_override": {"start_time": SETTLE_FRAMES / self.rate_hz},
             **self._settings,
         }
         ran = self._example.run(self._system, loop).objs

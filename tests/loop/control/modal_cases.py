@@ -30,6 +30,7 @@ def integrated(
     loop_gain: float = 0.4,
     gain: float = 0.8,
     filtered: float = 0.0,
+    noise: float = NOISE,
 ) -> tuple[Floats, Floats]:
     """Return slopes and commands of an integrator, with a matrix that is the identity.
 
@@ -45,13 +46,15 @@ def integrated(
         Of the slopes.
     filtered : float
         Part of each step that is taken back in the next frame.
+    noise : float
+        Standard deviation of that of the slopes.
     """
     whole, part = int(delay), delay % 1
     slopes, commands = np.zeros((2, len(open_loop) + whole + 1, open_loop.shape[1]))
-    noise = NOISE * rng.standard_normal(open_loop.shape)
+    errors = noise * rng.standard_normal(open_loop.shape)
     for k in range(whole + 1, len(slopes)):
         acting = (1 - part) * commands[k - whole] + part * commands[k - whole - 1]
-        slopes[k] = gain * (open_loop[k - whole - 1] + acting) + noise[k - whole - 1]
+        slopes[k] = gain * (open_loop[k - whole - 1] + acting) + errors[k - whole - 1]
         step = slopes[k] - filtered * slopes[k - 1]
         commands[k] = (1 - LEAK) * commands[k - 1] - loop_gain * step
     return slopes[whole + 1 :], commands[whole + 1 :]

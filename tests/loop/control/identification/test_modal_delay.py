@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 from tests.loop.control.modal_cases import integrated, wandering
 
 from faintspot.base.errors import InputError
@@ -35,6 +36,23 @@ def test_gain_of_a_known_delay() -> None:
     found = ModalFits(slopes, commands, RUN).of(2.0)
     assert (found.delay_frames, found.delay_error) == (2.0, 0.0)
     assert found.gain == pytest.approx(0.5, rel=0.2)
+
+
+def test_gain_of_a_bright_sensor_that_sees_fine_turbulence() -> None:
+    """Structure too fine for the mirror, in the slopes alone, up to 50 Hz."""
+    rng = np.random.default_rng(12)
+    fine = lfilter([1.0], np.poly([0.5] * 4), rng.standard_normal((FRAMES, 8)), axis=0)
+    seen = wandering(rng, FRAMES, 8) + 0.05 * fine / fine.std()
+    slopes, commands = integrated(seen, rng, gain=0.5, loop_gain=1.2, noise=0.001)
+    assert ModalFits(slopes, commands, RUN).of(2.0).gain == pytest.approx(0.5, rel=0.25)
+
+
+def test_a_gain_with_which_the_recorded_loop_was_not_stable_is_none() -> None:
+    """The stable limit of a delay of 2 frames is 1."""
+    rng = np.random.default_rng(13)
+    slopes, commands = integrated(wandering(rng, FRAMES), rng, gain=0.8, loop_gain=1.1)
+    found = ModalFits(slopes, commands, RUN).of(2.0)
+    assert 0.5 < found.gain < 1 / 1.1
 
 
 def test_the_law_is_named() -> None:

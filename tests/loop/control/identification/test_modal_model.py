@@ -5,11 +5,15 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 from tests.loop.control.modal_cases import NOISE, Floats, integrated, recorded, wandering
 
 from faintspot.base.errors import InputError
 from faintspot.loop.control.base import CommandDelayLine
+from faintspot.loop.control.identification.modal_loop import spectra_of_modes
+from faintspot.loop.control.identification.modal_model import coupling
 from faintspot.loop.control.identification.predictive_control import PredictiveControl, learn
+from faintspot.loop.control.kalman.modal_predictor import LAGS, modal_filter
 
 GAIN, LOOP_GAIN, DELAY = 0.8, 0.4, 2
 FRAMES = 2500
@@ -118,3 +122,20 @@ def test_bad_recordings_are_refused(change: dict[str, Any], message: str) -> Non
         commands = rng.standard_normal(commands.shape)
     with pytest.raises(InputError, match=message):
         learn(recorded(slopes, commands))
+
+
+@pytest.mark.parametrize(("carried", "least", "most"), [(True, 0.3, 1.0), (False, 0.0, 0.01)])
+def test_what_the_wind_carries_from_mode_to_mode_is_predicted(
+    carried: bool, least: float, most: float
+) -> None:
+    """Eight modes, each with what the one before it had 10 frames ago; or all independent."""
+    rng, frames = np.random.default_rng(11), 3000
+    first = lfilter([1.0], [1.0, -0.8], rng.standard_normal(frames + 70))
+    modes = np.array([first[70 - 10 * k : frames + 70 - 10 * k] for k in range(8)]).T
+    if not carried:
+        modes = lfilter([1.0], [1.0, -0.8], rng.standard_normal((frames, 8)), axis=0)
+    modes = modes + 0.5 * rng.standard_normal(modes.shape)
+    arrays = modal_filter(*spectra_of_modes(modes), 4, LAGS[-1] + 1)
+    found, saved = coupling(arrays, modes, DELAY)
+    assert found.shape == (len(LAGS) * 8, 8)
+    assert least <= saved <= most

@@ -4,7 +4,12 @@ import numpy as np
 import pytest
 from scipy.linalg import solve_discrete_are
 
-from faintspot.loop.control.kalman.modal_predictor import ModalPredictor, modal_filter, prediction_errors
+from faintspot.loop.control.kalman.modal_predictor import (
+    LAGS,
+    ModalPredictor,
+    modal_filter,
+    prediction_errors,
+)
 
 ORDER, NOISE = 4, 0.3
 
@@ -17,6 +22,9 @@ def spectrum(weights: np.ndarray) -> np.ndarray:
 WEIGHTS = np.array([[1.3, -0.4, 0.05, -0.02], [0.5, 0.2, -0.1, 0.1]])
 POWER = np.array([spectrum(row) for row in WEIGHTS]).T + NOISE
 ARRAYS = modal_filter(POWER, np.full(2, NOISE), ORDER)
+COUPLED = modal_filter(POWER, np.full(2, NOISE), ORDER, LAGS[-1] + 1)
+COUPLED["coupling"] = np.random.default_rng(2).standard_normal((len(LAGS), 2))
+"""By the past of the first mode."""
 
 
 def test_the_steady_state_is_that_of_the_riccati_equation() -> None:
@@ -49,8 +57,35 @@ def test_a_mode_that_was_not_measured_corrects_nothing() -> None:
     np.testing.assert_array_equal(one.state, other.state)
 
 
-def test_a_reply_is_what_a_surprise_adds_to_the_prediction() -> None:
-    predictor = ModalPredictor(ARRAYS)
+@pytest.mark.parametrize("arrays", [ARRAYS, COUPLED])
+def test_a_reply_is_what_a_surprise_adds_to_the_prediction(arrays: dict[str, np.ndarray]) -> None:
+    predictor = ModalPredictor(arrays)
     predictor.correct(np.array([1.0, 2.0]), np.full(2, NOISE))
     (reply,) = predictor.replies(2)
     np.testing.assert_allclose(reply @ [1.0, 2.0], predictor.ahead(2))
+
+
+@pytest.mark.parametrize("arrays", [ARRAYS, COUPLED])
+def test_matrices_predict_as_the_filter_does(arrays: dict[str, np.ndarray]) -> None:
+    predictor, rng = ModalPredictor(arrays), np.random.default_rng(3)
+    onward, correction, observation, ahead = predictor.matrices(2)
+    state = np.zeros(len(onward))
+    for row in rng.standard_normal((40, 2)):
+        predictor.correct(row, np.full(2, NOISE))
+        state = state + correction @ (row - observation @ state)
+        np.testing.assert_allclose(ahead @ state, predictor.ahead(2), atol=1e-12)
+        predictor.advance()
+        state = onward @ state
+
+
+def test_the_past_of_the_first_mode_corrects_all() -> None:
+    """By the estimate of 8 frames ago, where the coupling is that alone."""
+    coupling = np.zeros((len(LAGS), 2))
+    coupling[1] = 1.0, -2.0
+    alone, coupled = (
+        ModalPredictor(COUPLED | {"coupling": np.zeros((1, 2))}),
+        ModalPredictor(COUPLED | {"coupling": coupling}),
+    )
+    for predictor in alone, coupled:
+        predictor.begin(np.array([3.0, 1.0]))
+    np.testing.assert_allclose(coupled.ahead(2) - alone.ahead(2), [3.0, -6.0])

@@ -169,7 +169,7 @@ def _corrected(
 
 def _in_modes(ready: Prepared, modes: LoopInModes) -> tuple[LoopOfControl, Kalman]:
     """Learn from modes alone."""
-    learnt = learn_modes(modes.described.plant(), modes.seen.telemetry, modes.rate_hz)
+    learnt = learn_modes(modes)
     return _controlling(modes.described, ready, modes.seen, learnt)
 
 
@@ -186,7 +186,10 @@ def _controlling(
         advised = min(advised, ready.loop_gain)
     recorded, remarks = ready.loop_gain, list(loop.remarks)
     plain = recorded if math.isfinite(recorded) else advised
-    if abs(math.log(max(plain, 1e-9) / advised)) > math.log(_MOST_OFF):
+    is_off = abs(math.log(max(plain, 1e-9) / advised)) > math.log(_MOST_OFF)
+    if (
+        is_off and not described.analysis.size
+    ):  # of modes, the gain is less certain than that the loop has run
         plain = advised
         described = replace(described, recorded_gain=max(recorded, 1e-9) * gain)
         remarks.append(f"fallback integrator: gain {advised:.2g}, as the recorded {recorded:.2g} leaves more")

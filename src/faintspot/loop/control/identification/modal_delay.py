@@ -10,6 +10,7 @@ Vibrations count little, and their wings are a part of the sum.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -33,8 +34,12 @@ _MOST_MODES = 8
 _KNEES, _POWER = (1e-3, 3e-3, 1e-2, 3e-2), 3.0
 """Turbulence is a sum of (1 + (f / knee)^2)^-power, the knees in parts of the frame rate; a sum falls less
 steeply than each, as Zernike tilt does (power 11 / 6) and the mean gradient over a pupil (17 / 6)."""
+_FINE_KNEE, _MOST_MISFIT = 0.2, 1.0
+"""Knee of turbulence too fine for the mirror, of which bright sensors see a part; added where spectra do not
+fit: misfit of each frequency."""
 _STEP, _GAIN_STEPS, _UPDATES = 0.1, 36, 30
 _MOST_CONTRAST = 6.0  # of a frequency with more power than the model: vibrations count no more than that
+_UNSTABLE = 1e4  # by how much more unlikely a gain is with which the recorded loop would not be stable
 _CONTRADICTS = 10.0  # by how much more unlikely a delay is one that the recording contradicts
 _EXPECTED_GAIN = 0.4  # standard deviation of the gain's logarithm about 0, before anything is measured
 _MOST_PEAKS, _DAMPING = 4, 0.01  # bins of lines of a mode with wings, and these
@@ -80,12 +85,17 @@ class ModalFits:
         """(modes, frequencies, 1 + lags, 1 + lags)"""
         self._independent = INDEPENDENT * pieces
         power = self._products[..., 0, 0]
-        self._shapes = _shapes(window, power * _lines(power, self._independent))
+        lines = power * _lines(power, self._independent)
         self._gains = np.geomspace(GAINS[0], GAINS[1], _GAIN_STEPS)[1:-1]
-        self._strength: Floats | None = None
+        self._loop_gain = _gain_of_law(modes, sent, run, 1)
         self._delays = np.arange(1.0, MOST_DELAY + 0.5 * _STEP, _STEP)
-        self._all = np.array([self._misfit(delay) for delay in self._delays])
-        """(delays, gains): minus the logarithm of the likelihood."""
+        for knees in _KNEES, (*_KNEES, _FINE_KNEE):
+            self._shapes = _shapes(window, lines, knees)
+            self._strength: Floats | None = None
+            self._all = np.array([self._misfit(delay) for delay in self._delays])
+            """(delays, gains): minus the logarithm of the likelihood."""
+            if self._all.min() < _MOST_MISFIT * lines.size:
+                break
 
     def of(self, delay_frames: float) -> LoopDelay:
         """Return the gain for a delay that is known; that of the best one if it does not fit at all."""
@@ -132,7 +142,9 @@ class ModalFits:
         above = _MOST_CONTRAST * (1 - np.exp(-self._contrast(ratio) / _MOST_CONTRAST))
         below = self._independent * np.where(ratio < 1, ratio - np.log(ratio) - 1, 0.0)
         misfit: Floats = (above + below).sum(axis=(1, 2))
-        return misfit + 0.5 * (np.log(self._gains) / _EXPECTED_GAIN) ** 2
+        # A recorded integrator was stable.
+        unstable = self._gains * self._loop_gain > 2 * math.sin(math.pi / (4 * delay - 2))
+        return misfit + 0.5 * (np.log(self._gains) / _EXPECTED_GAIN) ** 2 + _UNSTABLE * unstable
 
     def _contrast(self, ratio: Floats) -> Floats:
         """Return the contrast of powers above the model, 0 below it."""
@@ -140,7 +152,7 @@ class ModalFits:
         return contrast
 
 
-def _shapes(window: Floats, lines: Floats) -> Floats:
+def _shapes(window: Floats, lines: Floats, knees: Sequence[float]) -> Floats:
     """Return windowed spectra of noise, turbulence and lines of each mode, (modes, parts, frequencies).
 
     Parameters
@@ -148,13 +160,15 @@ def _shapes(window: Floats, lines: Floats) -> Floats:
     window : (frames,) array
     lines : (modes, frequencies) array
         Power in the lines of each mode, 0 elsewhere; the wings of the highest ones are parts.
+    knees : sequence of float
+        Of the turbulence.
     """
     frames, frequency = len(window), np.fft.fftfreq(_FREQUENCIES)
     seen = np.correlate(window, window, "full")[frames - 1 :]
     seen[1:] *= 2
     bins = bins_of(frames)
     cosines = np.cos(2 * np.pi / frames * np.outer(bins, np.arange(frames)))
-    moments = [np.fft.ifft((1 + (frequency / knee) ** 2) ** -_POWER).real[:frames] for knee in _KNEES]
+    moments = [np.fft.ifft((1 + (frequency / knee) ** 2) ** -_POWER).real[:frames] for knee in knees]
     common = [np.ones(len(bins)), *(cosines @ (seen * moment / moment[0]) for moment in moments)]
     parts = []
     for line in lines:
@@ -177,20 +191,26 @@ def law_of(modes: Floats, sent: Floats, run: NDArray[np.int64]) -> str:
 
     Parameters as for `ModalFits`.
     """
+    gain = _gain_of_law(modes, sent, run, 1)
+    if math.isfinite(gain):
+        return f"{INTEGRATOR} of gain {gain:.2g}"
+    return FILTERED if math.isfinite(_gain_of_law(modes, sent, run, 4)) else OTHER
+
+
+def _gain_of_law(modes: Floats, sent: Floats, run: NDArray[np.int64], before: int) -> float:
+    """Return the gain of the integrator that made the commands from so many frames; NaN: another law did."""
     moved = np.flatnonzero(sent.std(axis=0) > _LEAST_MOVED * sent.std(axis=0).max())
-    for name, before in ((INTEGRATOR, 1), (FILTERED, 4)):
-        rows = np.flatnonzero(run[before:] == run[:-before]) + before
-        left = total = 0.0
-        gains, kept = [], []
-        for mode, command in zip(modes.T[moved], sent.T[moved], strict=True):
-            past = [command[rows - k] for k in range(1, before + 1)]
-            now = [mode[rows - k] for k in range(before)]
-            terms, steps = np.array([*now, *past]).T, command[rows] - command[rows - 1]
-            weights = np.linalg.lstsq(terms, command[rows], rcond=None)[0]
-            left += float(np.square(command[rows] - terms @ weights).sum())
-            total += float(np.square(steps - steps.mean()).sum())
-            gains.append(-float(weights[:before].sum()))
-            kept.append(float(weights[before:].sum()))
-        if left <= _EXACT**2 * total and min(kept) > _LEAST_KEPT:
-            return f"{name} of gain {np.median(np.abs(gains)):.2g}" if name == INTEGRATOR else name
-    return OTHER
+    rows = np.flatnonzero(run[before:] == run[:-before]) + before
+    left = total = 0.0
+    gains, kept = [], []
+    for mode, command in zip(modes.T[moved], sent.T[moved], strict=True):
+        past = [command[rows - k] for k in range(1, before + 1)]
+        now = [mode[rows - k] for k in range(before)]
+        terms, steps = np.array([*now, *past]).T, command[rows] - command[rows - 1]
+        weights = np.linalg.lstsq(terms, command[rows], rcond=None)[0]
+        left += float(np.square(command[rows] - terms @ weights).sum())
+        total += float(np.square(steps - steps.mean()).sum())
+        gains.append(-float(weights[:before].sum()))
+        kept.append(float(weights[before:].sum()))
+    is_law = left <= _EXACT**2 * total and min(kept) > _LEAST_KEPT
+    return float(np.median(np.abs(gains))) if is_law else math.nan

@@ -1,4 +1,4 @@
-"""Model of a loop without geometry: modes of the interaction matrix, each predicted on its own."""
+"""Model of a loop without geometry: modes of the interaction matrix, from their past and that of others."""
 
 from __future__ import annotations
 
@@ -18,35 +18,46 @@ from faintspot.loop.control.identification.model import Kalman
 from faintspot.loop.control.identification.open_loop import OpenLoop, site_of_loop
 from faintspot.loop.control.identification.recording import Recording
 from faintspot.loop.control.integrator import LoopPlant
-from faintspot.loop.control.kalman.modal_predictor import modal_filter, prediction_errors
+from faintspot.loop.control.kalman.modal_predictor import (
+    LAGS,
+    ModalPredictor,
+    modal_filter,
+    prediction_errors,
+)
+from faintspot.loop.control.kalman.predictor import LARGEST_VARIANCE_PX2
 
 Floats = NDArray[np.float64]
-Kind = Callable[[Kalman, LoopPlant, OpenLoopTelemetry, float], Kalman]
+Kind = Callable[[Kalman, LoopPlant, OpenLoopTelemetry, LoopInModes], Kalman]
 
 _ORDERS = (4, 8, 12, 20, 30, 50, 80, 120, 200)
 _FRAMES_FOR_ORDER = 80  # frames of a recording for each coefficient
 _SPECTRUM_FOR_ORDER = 5  # frames of a piece of the spectrum for each coefficient
 _BLOCKS, _MOST_COMPARED = 4, 100  # of frames left out, and modes, by which orders are compared
+_FEWEST_COUPLED, _MOST_SOURCES = (
+    8,
+    60,
+)  # modes: fewer are independent; by the past of so many all are predicted
+_UNCERTAIN = 0.1  # of the variance of residual modes: gains differ by so much between modes and with time
+_RIDGES = (0.1, 0.3, 1.0, 3.0, 10.0)  # of the mean square of the past
 
 
 def learn_modes(
-    plant: LoopPlant, telemetry: OpenLoopTelemetry, rate_hz: float, of_commands: Floats | None = None
+    modes: LoopInModes, telemetry: OpenLoopTelemetry | None = None, of_commands: Floats | None = None
 ) -> Kalman:
-    """Return a filter of independent modes: autoregressions or, of two modes, oscillators.
+    """Return a filter of modes: autoregressions or, of two modes, oscillators.
 
     Of both, what leaves less of the last third, learnt on the rest, is learnt from all frames.
 
     Parameters
     ----------
-    plant : LoopPlant
-        With the interaction matrix in modes.
-    telemetry : OpenLoopTelemetry
-        Open-loop modes.
-    rate_hz : float
-        Frames per second.
+    modes : LoopInModes
+    telemetry : OpenLoopTelemetry, optional
+        Open-loop modes of some of its frames. Default: of all.
     of_commands : (commands, commands) array, optional
         From commands to compared amplitudes, see `Kalman`. Default: to the modes that they cause.
     """
+    plant = modes.described.plant()
+    telemetry = modes.seen.telemetry if telemetry is None else telemetry
     if of_commands is None:
         values, vectors = np.linalg.eigh(plant.interaction.T @ plant.interaction)
         of_commands = (vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T
@@ -55,7 +66,7 @@ def learn_modes(
     model = Kalman({}, gain, 1.0, (math.inf, residual), of_commands)
 
     def learnt(kind: Kind, learning: OpenLoopTelemetry, scored: OpenLoopTelemetry) -> Kalman:
-        return kind(model, plant, learning, rate_hz).scored(plant, scored)
+        return kind(model, plant, learning, modes).scored(plant, scored)
 
     kinds: list[Kind] = [_autoregressions]
     if len(plant.interaction) == 2:
@@ -67,18 +78,27 @@ def learn_modes(
     return learnt(kinds[0], telemetry, replayed_part(telemetry, len(plant.interaction)))
 
 
-def _autoregressions(model: Kalman, plant: LoopPlant, telemetry: OpenLoopTelemetry, rate_hz: float) -> Kalman:
+def _autoregressions(
+    model: Kalman, plant: LoopPlant, telemetry: OpenLoopTelemetry, loop: LoopInModes
+) -> Kalman:
     modes = np.where(telemetry.trust > 0, telemetry.open_loop_px, np.nan)
     orders = best_orders(modes, plant.delay_frames)
     text = f"{orders.min()}" if orders.min() == orders.max() else f"{orders.min()} to {orders.max()}"
     description = f"{len(orders)} mode{'s' * (len(orders) > 1)}, autoregressions of order {text}"
-    return replace(model, arrays=modal_filter(*spectra_of_modes(modes), orders), description=description)
+    power, noise = spectra_of_modes(modes)
+    uncertain, is_coupled = _UNCERTAIN * loop.seen.residual.var(axis=0), len(orders) >= _FEWEST_COUPLED
+    rows = LAGS[-1] + 1 if is_coupled else 0
+    arrays = modal_filter(power + uncertain, noise + uncertain, orders, rows)
+    if is_coupled:
+        arrays["coupling"], saved = coupling(arrays, modes, plant.delay_frames)
+        description += f", whose errors the past of others makes smaller by {100 * saved:.1f} %"
+    return replace(model, arrays=arrays, description=description)
 
 
-def _oscillators(model: Kalman, plant: LoopPlant, telemetry: OpenLoopTelemetry, rate_hz: float) -> Kalman:
+def _oscillators(model: Kalman, plant: LoopPlant, telemetry: OpenLoopTelemetry, loop: LoopInModes) -> Kalman:
     """Return the filter of two modes as of tip and tilt of a single sub-aperture."""
-    single = Recording(np.zeros((1, 2)), None, None, np.zeros((1, 2)), rate_hz)
-    fit = Identification(telemetry, site_of_loop(single), rate_hz).layers()
+    single = Recording(np.zeros((1, 2)), None, None, np.zeros((1, 2)), loop.rate_hz)
+    fit = Identification(telemetry, site_of_loop(single), loop.rate_hz).layers()
     return model.learnt(plant, telemetry, [fit])
 
 
@@ -107,6 +127,56 @@ def best_orders(modes: Floats, frames: int) -> NDArray[np.int64]:
     return np.asarray(orders[np.argmin(left, axis=0)][nearest])
 
 
+def coupling(arrays: dict[str, Floats], modes: Floats, frames: int) -> tuple[Floats, float]:
+    """Return how the past of the strongest modes corrects predictions, and what part of errors that saves.
+
+    By ridge regression of the errors of predictions, the ridge chosen on frames left out, block by block.
+
+    Parameters
+    ----------
+    arrays : dict
+        Filter of independent modes, see `ModalPredictor`.
+    modes : (frames, k) array
+        Open-loop modes; NaN where not measured.
+    frames : int
+        For how many frames later modes are predicted.
+
+    Returns
+    -------
+    (lags * sources, k) array, float
+        The coupling, 0 if it saves nothing, and the part.
+    """
+    past, errors = _past_and_errors(arrays, modes, frames)
+    blocks = np.array_split(np.arange(len(past)), _BLOCKS)
+    products = [(past[block].T @ past[block], past[block].T @ errors[block]) for block in blocks]
+    square, crossed = (np.sum(parts, axis=0) for parts in zip(*products, strict=True))
+    ridges = np.multiply.outer(_RIDGES, np.trace(square) / len(square) * np.eye(len(square)))
+    left = np.zeros(len(_RIDGES))
+    for block, (own, own_crossed) in zip(blocks, products, strict=True):
+        for number, ridge in enumerate(ridges):
+            weights = np.linalg.solve(square - own + ridge, crossed - own_crossed)
+            left[number] += float(np.square(errors[block] - past[block] @ weights).sum())
+    saved = 1 - float(left.min() / np.square(errors).sum())
+    if saved <= 0:
+        return np.zeros_like(crossed), 0.0
+    return np.linalg.solve(square + ridges[int(np.argmin(left))], crossed), saved
+
+
+def _past_and_errors(arrays: dict[str, Floats], modes: Floats, frames: int) -> tuple[Floats, Floats]:
+    """Return the past of the strongest modes, and by how much modes then differ from their prediction."""
+    predictor, sources = ModalPredictor(arrays), min(modes.shape[1], _MOST_SOURCES)
+    past, errors = np.zeros((len(modes), len(LAGS) * sources)), np.full(modes.shape, np.nan)
+    measured = np.asarray(np.isfinite(modes).all(axis=1))
+    for number, (row, is_measured) in enumerate(zip(np.nan_to_num(modes), measured, strict=True)):
+        predictor.correct(row, np.full(len(row), 0.0 if is_measured else LARGEST_VARIANCE_PX2))
+        past[number] = predictor.past(sources)
+        if number + frames < len(modes):
+            errors[number] = modes[number + frames] - predictor.ahead(frames)
+        predictor.advance()
+    used = np.flatnonzero(np.isfinite(errors).all(axis=1))[len(arrays["gains"]) :]
+    return past[used], errors[used]
+
+
 def share_of_modes(modes: LoopInModes, winds: Kalman, plant: LoopPlant, seen: OpenLoop) -> float:
     """Return what modes leave, in what a filter of winds leaves of the last third of its slopes.
 
@@ -121,8 +191,8 @@ def share_of_modes(modes: LoopInModes, winds: Kalman, plant: LoopPlant, seen: Op
     seen : OpenLoop
         What it has learnt from.
     """
-    own, telemetry, rate_hz = modes.described.plant(), modes.seen.telemetry, modes.rate_hz
+    own, telemetry = modes.described.plant(), modes.seen.telemetry
     first = len(telemetry) - round(JUDGED_PART * len(telemetry))
-    learnt = learn_modes(own, telemetry.part(0, first), rate_hz, winds.phase_of_commands)
+    learnt = learn_modes(modes, telemetry.part(0, first), winds.phase_of_commands)
     left = learnt.scored(own, telemetry.part(first, None)).left[0]
     return left / winds.scored(plant, seen.telemetry.part(first, None)).left[0]

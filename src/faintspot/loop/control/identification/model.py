@@ -31,7 +31,7 @@ from faintspot.loop.control.kalman.large_guarded import LargeGuarded
 from faintspot.loop.control.kalman.local_model import STEPS, slopes_ahead, state_of_state, state_of_surprise
 from faintspot.loop.control.kalman.local_predictor import LocalPredictor, local_filter, local_shapes
 from faintspot.loop.control.kalman.modal_predictor import ARRAYS as MODAL
-from faintspot.loop.control.kalman.modal_predictor import ModalPredictor
+from faintspot.loop.control.kalman.modal_predictor import ModalPredictor, modal_shapes
 from faintspot.loop.control.kalman.predictor import MOST_SLOPES, SlopeModel, SlopePredictor, steady_covariance
 from faintspot.loop.control.replay import mean_residual
 
@@ -52,7 +52,7 @@ _RANGES = {
     "plain_gain": (0.0, 2.0),
     "noise_factor": (1e-6, 1e6),
     _GAIN: (1e-3, 1e3),
-    **dict.fromkeys(("first", "second", "weights", "corrections", *MODAL[:2]), _ANY),
+    **dict.fromkeys(("first", "second", "weights", "corrections", *MODAL[:3]), _ANY),
     **dict.fromkeys(("driving_px2", "covariance_xy_px2"), _COVARIANCE_PX2),  # those of slopes of 1e4 px
     "variance_px2": (1e-12, 1e8),
     "predicted_px2": (0.0, 1e8),
@@ -280,8 +280,7 @@ def _checked(arrays: Mapping[str, object], plant: LoopPlant) -> dict[str, Floats
     if "around" in numbers:
         shapes |= local_shapes(numbers, slopes)
     elif MODAL[0] in numbers:
-        shapes |= dict.fromkeys(MODAL[:2], (len(np.atleast_1d(numbers[MODAL[0]])), slopes))
-        shapes["predicted_px2"] = (slopes,)
+        shapes |= modal_shapes(numbers, slopes)
     else:
         layers = len(numbers["first"]) if numbers["first"].ndim == 3 else 1
         shapes |= {**dict.fromkeys(_LAYERS, (layers, slopes, slopes)), "covariance_xy_px2": (slopes // 2,)}

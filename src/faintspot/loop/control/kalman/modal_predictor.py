@@ -1,6 +1,7 @@
-"""Kalman filters of modes that are independent of each other: autoregressions seen through white noise.
+"""Kalman filters of modes: autoregressions seen through white noise, each on its own.
 
-No geometry of the sensor is known to them, and their work is proportional to the number of modes.
+What the past of the strongest modes tells beyond that of each mode is added to its prediction: turbulence
+that the wind carries is in some modes before it is in others. No geometry of the sensor is known.
 """
 
 from __future__ import annotations
@@ -19,8 +20,10 @@ from faintspot.loop.control.kalman.predictor import LARGEST_VARIANCE_PX2
 
 Floats = NDArray[np.float64]
 
-ARRAYS = "coefficients", "gains", "variance_px2", "predicted_px2"
+ARRAYS = "coefficients", "gains", "coupling", "variance_px2", "predicted_px2"
 """Names of a filter's arrays."""
+LAGS = 0, 8, 16, 24
+"""Frames of the past by which modes predict others."""
 _RIDGE = 1e-4  # of the variance of a mode
 _LEAST_SIGNAL = 0.02  # of the noise, that the spectrum of a mode has at every frequency
 _LEAST_DRIVING = 1e-9  # of the variance of a mode
@@ -37,9 +40,10 @@ class ModalPredictor:
     """
 
     def __init__(self, arrays: Mapping[str, Any]) -> None:
-        self._coefficients, self._gains, self._noise_px2, self._predicted_px2 = (
+        self._coefficients, self._gains, self._coupling, self._noise_px2, self._predicted_px2 = (
             np.ascontiguousarray(arrays[name], np.float64) for name in ARRAYS
         )
+        self._sources = len(self._coupling) // len(LAGS)
         self.std_px = np.sqrt(self._predicted_px2)
         """(m,): standard deviations of the prediction."""
         self.state = np.zeros_like(self._coefficients)
@@ -53,7 +57,12 @@ class ModalPredictor:
 
     def ahead(self, frames: int) -> Floats:
         """Return (m,): the modes predicted for a number of frames after the current one."""
-        return np.asarray((self.weights_ahead(frames) * self.state).sum(axis=0))
+        own = (self.weights_ahead(frames) * self.state).sum(axis=0)
+        return np.asarray(own + self.past(self._sources) @ self._coupling if self._sources else own)
+
+    def past(self, sources: int) -> Floats:
+        """Return (lags * sources,): the first modes as estimated now, of `LAGS` frames ago."""
+        return np.asarray(self.state[list(LAGS), :sources].ravel())
 
     def weights_ahead(self, frames: int) -> Floats:
         """Return (order, m): weights of the state in the modes a number of frames later."""
@@ -68,7 +77,15 @@ class ModalPredictor:
 
     def replies(self, frames: int) -> list[Any]:
         """Return how predicted modes answer to surprises, (m, m), for every set of gains: there is one."""
-        return [sparse.diags((self.weights_ahead(frames) * self._gains).sum(axis=0)).tocsr()]
+        own = sparse.diags((self.weights_ahead(frames) * self._gains).sum(axis=0)).tocsr()
+        if not self._sources:
+            return [own]
+        replies = own.toarray()
+        coupled = self._coupling.reshape(len(LAGS), self._sources, -1)
+        replies[:, : self._sources] += np.einsum(
+            "ls,lsm->ms", self._gains[list(LAGS), : self._sources], coupled
+        )
+        return [replies]
 
     def begin(self, slopes_px: Floats) -> None:
         """Restart from constant open-loop modes."""
@@ -105,7 +122,18 @@ class ModalPredictor:
         onward = np.eye(order * m, k=-m)
         onward[:m] = _side_by_side(self._coefficients)
         observation, ahead = (_side_by_side(self.weights_ahead(k)) for k in (0, frames))
+        for number, lag in enumerate(LAGS if self._sources else ()):
+            coupled = self._coupling[number * self._sources : (number + 1) * self._sources]
+            ahead[:, lag * m : lag * m + self._sources] += coupled.T
         return onward, _side_by_side(self._gains).T, observation, ahead
+
+
+def modal_shapes(arrays: Mapping[str, Floats], modes: int) -> dict[str, tuple[int, ...]]:
+    """Return the shapes that the arrays of a filter of so many modes have; other ones are damaged."""
+    rows, coupled = (len(np.atleast_1d(arrays[name])) for name in ("coefficients", "coupling"))
+    sources = min(coupled // len(LAGS), modes) if rows > LAGS[-1] else 0
+    shapes: dict[str, tuple[int, ...]] = dict.fromkeys(("coefficients", "gains"), (rows, modes))
+    return shapes | {"coupling": (max(len(LAGS) * sources, 1), modes), "predicted_px2": (modes,)}
 
 
 def _side_by_side(values: Floats) -> Floats:
@@ -113,8 +141,8 @@ def _side_by_side(values: Floats) -> Floats:
     return np.hstack([np.diag(row) for row in values])
 
 
-def modal_filter(power: Floats, noise_px2: Floats, orders: ArrayLike) -> dict[str, Floats]:
-    """Return the arrays of a `ModalPredictor`.
+def modal_filter(power: Floats, noise_px2: Floats, orders: ArrayLike, rows: int = 0) -> dict[str, Floats]:
+    """Return the arrays of a `ModalPredictor` of modes that are independent of each other.
 
     The spectrum without its noise gives autocovariances, these an autoregression (Yule-Walker). The gains of
     the steady state follow from the factor of the spectrum, noise included, that is causal with its inverse
@@ -128,15 +156,18 @@ def modal_filter(power: Floats, noise_px2: Floats, orders: ArrayLike) -> dict[st
     noise_px2 : (m,) array
         Variance of the white noise.
     orders : int or (m,) array of int
+    rows : int
+        Frames of the past in the state, if more than the largest order.
 
     Returns
     -------
     dict
-        coefficients, gains (largest order, m); variance_px2, predicted_px2 (m,): of noise, and of the
-        prediction's error.
+        coefficients, gains (rows or largest order, m); coupling (1, m): none; variance_px2, predicted_px2
+        (m,): of noise, and of the prediction's error.
     """
     of_modes = np.broadcast_to(orders, noise_px2.shape)
-    coefficients, gains = np.zeros((2, int(of_modes.max()), len(of_modes)))
+    rows = max(rows, int(of_modes.max()))
+    coefficients, gains = np.zeros((2, rows, len(of_modes)))
     predicted = np.zeros(len(of_modes))
     for mode, (spectrum, noise, order) in enumerate(zip(power.T, noise_px2, of_modes, strict=True)):
         moments = np.fft.ifft(np.maximum(spectrum - noise, _LEAST_SIGNAL * noise)).real[: order + 1]
@@ -149,8 +180,9 @@ def modal_filter(power: Floats, noise_px2: Floats, orders: ArrayLike) -> dict[st
         cepstrum[_FREQUENCIES // 2 :] = cepstrum[0] = 0.0
         factor = np.exp(np.fft.fft(cepstrum))
         coefficients[:order, mode], predicted[mode] = weights, max(total - noise, 0.0)
-        gains[:order, mode] = np.fft.fft(signal / factor.conj()).real[:order] / _FREQUENCIES / total
-    return dict(zip(ARRAYS, (coefficients, gains, noise_px2, predicted), strict=True))
+        gains[:, mode] = np.fft.fft(signal / factor.conj()).real[:rows] / _FREQUENCIES / total
+    uncoupled = np.zeros((1, len(of_modes)))
+    return dict(zip(ARRAYS, (coefficients, gains, uncoupled, noise_px2, predicted), strict=True))
 
 
 def prediction_errors(arrays: Mapping[str, Floats], modes: Floats, frames: int) -> Floats:
@@ -159,6 +191,7 @@ def prediction_errors(arrays: Mapping[str, Floats], modes: Floats, frames: int) 
     Parameters
     ----------
     arrays : mapping
+        Of modes that are independent of each other.
     modes : (frames, m) array
         Open-loop modes.
     frames : int
