@@ -203,13 +203,13 @@ def _report_night(
     settle: int | None,
 ) -> None:
     """Write the page and the numbers of methods that alternated."""
-    from faintspot.experiments.night.recorded import recorded_night
-    from faintspot.experiments.night.recorded_methods import read_strehl
-    from faintspot.experiments.night.recorded_page import (
+    from faintspot.experiments.night.recorded import (
         page_of_recording,
+        recorded_night,
         summary_of_recording,
         text_of_recording,
     )
+    from faintspot.experiments.night.recorded_methods import read_strehl
 
     measured = None if strehl is None else read_strehl(strehl)
     night = recorded_night(

@@ -22,14 +22,15 @@ from tests.refusals import refused
 
 from faintspot.base.report.page import Table
 from faintspot.experiments.night.analysis import difference, drift_of_r0, groups
-from faintspot.experiments.night.recorded import alternates, recorded_night
-from faintspot.experiments.night.recorded_methods import MeasuredStrehl, read_strehl
-from faintspot.experiments.night.recorded_page import (
+from faintspot.experiments.night.recorded import (
+    alternates,
     page_of_recording,
     phase_differences,
+    recorded_night,
     summary_of_recording,
     text_of_recording,
 )
+from faintspot.experiments.night.recorded_methods import MeasuredStrehl, read_strehl
 from faintspot.loop.control.options import ControlOptions
 from faintspot.slopes.sensor.layout import Layout
 
