@@ -9,8 +9,7 @@ from faintspot.loop.simulation.telescope import (
 from faintspot.slopes.estimators.base import Estimator
 from faintspot.slopes.estimators.built_in.gravity import BrightestPixels, Thresholded
 from faintspot.slopes.estimators.built_in.maximum_likelihood import MaximumAPosteriori, MaximumLikelihood
-from faintspot.slopes.estimators.built_in.smoothed import Smoothed
-from faintspot.slopes.estimators.built_in.total_variation import TotalVariation
+from faintspot.slopes.estimators.built_in.total_variation import Smoothed, TotalVariation
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""Estimators of a spot's position: one module each, with a class that describes itself completely.
+"""Estimators of a spot's position: classes that describe themselves completely.
 
 A new estimator is a module like these: a frozen dataclass with its options, and either `locate` in NumPy or a
 compiled kernel. `docs/estimators.md` describes them.

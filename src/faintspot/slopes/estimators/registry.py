@@ -84,7 +84,7 @@ _PACKAGE = "faintspot.slopes.estimators.built_in"
 _MODULES = {
     "brightest": "gravity",
     "tv": "total_variation",
-    "smoothed": "smoothed",
+    "smoothed": "total_variation",
     "centroid": "gravity",
     "thresholded": "gravity",
     "window": "window",

@@ -1,1 +1,1 @@
-"""The estimators, one in each file."""
+"""The estimators; those that share steps share a module."""
