@@ -300,10 +300,10 @@ def _record(run: SlopesRun, index: int) -> dict[str, object]:
         "noise": noise,
         "noise_arcsec": None if scale is None else noise * scale,
         "is_last": ranked and is_last,
-        "statistics.relative_gain": relative if ranked and not is_last else None,
+        "relative_gain": relative if ranked and not is_last else None,
         "noise_at_equal_gain": statistics.median(comparison.equal_noise(index)) if ranked else None,
         "stated_error": method.standard_error_px,
-        "statistics.jitter": statistics.median(run.jitters[index].px),
+        "jitter": statistics.median(run.jitters[index].px),
         "summary": run.summaries[index],
     }
 
