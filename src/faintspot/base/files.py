@@ -68,8 +68,13 @@ def check_bytes(name: object, total: int, most: int, what: str) -> None:
         raise InputError(f"{name}: needs {size} of memory, expected {what} of at most {limit}")
 
 
+_USUAL_MEMORY = 8 << 30  # bytes, assumed on Windows
+
+
 def memory_bytes() -> int:
     """Return the memory of the machine in bytes."""
+    if not hasattr(os, "sysconf"):
+        return _USUAL_MEMORY
     return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
 
 
@@ -211,7 +216,7 @@ def replace_file(path: Path, content: Content) -> None:
 
 def sync_file(path: Path) -> None:
     """Wait until the content of a file is on disk."""
-    descriptor = os.open(path, os.O_RDONLY)
+    descriptor = os.open(path, os.O_RDONLY if path.is_dir() else os.O_RDWR)  # Windows synchronises no other
     try:
         os.fsync(descriptor)
     finally:

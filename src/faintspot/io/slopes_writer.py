@@ -49,7 +49,8 @@ class OutputLock:
         try:
             try:
                 self._lock.acquire()
-                self._file.write_text(f"{os.getpid()}\n{socket.gethostname()}\n")
+                with contextlib.suppress(PermissionError):  # Windows lets nobody write to a locked file
+                    self._file.write_text(f"{os.getpid()}\n{socket.gethostname()}\n")
             except OSError as error:
                 if error.errno not in _NO_LOCKS:
                     raise

@@ -17,7 +17,7 @@ def no_trials(monkeypatch: pytest.MonkeyPatch) -> None:
     """Take the first of the settings that would be tried, which takes most of a second."""
 
     def first(trial: Any) -> tuple[Settings, float]:
-        width = float(f"{trial._fwhm:.3g}")
+        width = float(f"{trial.fwhm_px:.3g}")
         return Settings("weighted", weight_fwhm_px=width, spot_fwhm_px=width), 1.0
 
     monkeypatch.setattr("faintspot.slopes.recorded.first_settings._Trial.best", first)

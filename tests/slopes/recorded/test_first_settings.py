@@ -129,3 +129,39 @@ def test_spots_that_overlap_get_a_narrow_weight() -> None:
     frame = (sums + rng.normal(0.0, 1.0, sums.shape)).reshape(1, N * side, side)
     found = first_settings(layout, fs.Calibration(dark=0.0), frame)
     assert error(found.settings, layout, frame.astype(np.float32), places[None]) < 0.1
+
+
+def array_of_wide_spots(fwhm_px: float, moved: NDArray[np.float64]) -> tuple[NDArray[np.float64], fs.Layout]:
+    """Return frames of 8 x 8 spots at 12 px, all displaced alike, and their layout."""
+    layout = replace(fs.Layout.grid((8, 8), pixels=12), pitch_px=12.0)
+    away = np.arange(96) - (12 * np.arange(8)[:, None] + 5.5)  # (spots, pixels)
+    x, y = (
+        np.exp(-4 * np.log(2) * ((away - moved[:, axis, None, None]) / fwhm_px) ** 2).sum(axis=1)
+        for axis in range(2)
+    )
+    return 5000 * y[:, :, None] * x[:, None, :], layout
+
+
+@pytest.mark.parametrize("fwhm_px", [6.0, 8.4])
+def test_spots_as_wide_as_their_neighbours_are_far(fwhm_px: float) -> None:
+    """Systematic errors below 0.03 px up to 0.7 of the pitch, as the prediction says; the width is known."""
+    rng = np.random.default_rng(1)
+    flat, layout = array_of_wide_spots(fwhm_px, np.zeros((1, 2)))
+    found = first_settings(layout, fs.Calibration(dark=0.0), flat + rng.normal(0.0, 3.0, flat.shape))
+    assert found.fwhm_px == pytest.approx(fwhm_px, rel=0.05)
+    assert found.systematic_px is not None
+    assert found.systematic_px < 0.03
+    assert not found.doubt
+    moved = rng.uniform(-1.0, 1.0, (20, 2))
+    images, _ = array_of_wide_spots(fwhm_px, moved)
+    slopes = fs.SlopePipeline(layout, found.settings, fs.Calibration(dark=0.0))(images.astype(np.float32))
+    errors = np.stack([slopes.x, slopes.y], axis=-1) - moved[:, None]
+    assert np.abs(errors - errors.mean(axis=0)).max() < 0.03
+    at_edge_px = float(np.abs(errors.mean(axis=0)).max())  # the same in all frames
+    assert 0.4 * at_edge_px < found.at_edge_px < max(1.5 * at_edge_px, 0.01)
+
+
+def test_spots_wider_than_their_pitch_are_doubtful() -> None:
+    flat, layout = array_of_wide_spots(10.5, np.zeros((1, 2)))
+    noise = np.random.default_rng(1).normal(0.0, 3.0, flat.shape)
+    assert "0.75 of the pitch" in first_settings(layout, fs.Calibration(dark=0.0), flat + noise).doubt

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from faintspot.cli.layout import options as layout_options
@@ -13,6 +15,7 @@ from faintspot.slopes.sensor.layout import Layout
 from faintspot.slopes.sensor.stated import reference_in_words
 
 _MOST_NAMED = 12  # sub-apertures in one line
+_LARGE_PX = 0.03  # constant error at the pupil's edge
 
 
 def describe_settings(settings: Settings, layout: Layout, seen: FirstSettings, unit: str) -> list[str]:
@@ -27,6 +30,16 @@ def describe_settings(settings: Settings, layout: Layout, seen: FirstSettings, u
         lines.append(
             f"  the flux of single frames is too low for full slopes: they show {seen.response:.2f} of the "
             "displacements; `faintspot tune --recording` says what is possible"
+        )
+    if math.isfinite(seen.systematic_px or math.inf):
+        lines.append(
+            f"  S-curve: systematic errors up to {seen.systematic_px:.3f} px wherever a spot of "
+            f"{seen.fwhm_px:.2g} px lies in its pixels, in simulations of Gaussian spots"
+        )
+    if seen.at_edge_px > _LARGE_PX:
+        lines.append(
+            "  spots overlap: where neighbours are missing, slopes are off by up to "
+            f"{plain(seen.at_edge_px)} px, the same in all frames; a reference of the same spots takes it off"
         )
     return lines
 
