@@ -91,7 +91,7 @@ def certify(wavefront: Wavefront, *, wavelength_nm: float | None = None, draws: 
     >>> slopes = fs.SlopePipeline(layout, fs.Settings("brightest", keep_brightest=30))(frames)
     >>> found = certify(fs.fit_wavefront(slopes, layout, modes=5), wavelength_nm=633.0)
     >>> print(f"rms {found.rms.value:.0f} nm, from {found.rms.low:.0f} to {found.rms.high:.0f} nm")
-    rms 749 nm, from 743 to 755 nm
+    rms 749 nm, from 744 to 755 nm
     """
     if wavelength_nm is not None:
         number_between("wavelength_nm", wavelength_nm, 1.0)
