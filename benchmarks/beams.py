@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from benchmarks import references
 from benchmarks.measuring import Row, Table
 from benchmarks.simulated_arrays import RATIOS, Floats, Points, gaussians
 from faintspot.base.errors import InputError
@@ -128,7 +129,7 @@ def judged(truth: Beam, found: FoundLayout) -> dict[str, float]:
 
 
 def run(number: int = NUMBER, seed: int = SEED) -> list[Table]:
-    """Judge the layouts of random beams."""
+    """Judge the layouts of random beams, and differences from references of another light."""
     sums: dict[str, dict[str, float]] = {}
     for index in range(number):
         truth = beam(seed, index)
@@ -147,7 +148,7 @@ def run(number: int = NUMBER, seed: int = SEED) -> list[Table]:
         Row(kind, {name: total.get(name, 0.0) for name in names}, "none unsaid or false", _met(total))
         for kind, total in sums.items()
     ]
-    return [Table("beams", f"Lit spots of {number} random beams (seed {seed})", rows)]
+    return [Table("beams", f"Lit spots of {number} random beams (seed {seed})", rows), references.table()]
 
 
 def _met(total: dict[str, float]) -> bool:

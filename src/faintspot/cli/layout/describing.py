@@ -82,10 +82,8 @@ def _displaced_spots(found: FoundLayout) -> list[str]:
         at_edge = np.count_nonzero(depth < 0.5 * found.lenslets.pitch_px)
         where = f", {at_edge} of them at the frame's edge" if at_edge else ""
         spots = "1 lit spot lies" if count == 1 else f"{count} lit spots lie"
-        lines.append(
-            f"  {spots} outside all windows{where}: see the circles in the picture; smaller "
-            "--illuminated-fraction takes dim lenslets"
-        )
+        more = "; a smaller --illuminated-fraction takes dim lenslets" if at_edge < count else ""
+        lines.append(f"  {spots} outside all windows{where}: see the circles in the picture{more}")
     if (drift := np.linalg.norm(found.lenslets.drifts, axis=1).max()) > 0:
         lines.append(
             f"  the windows follow spots that lie up to {drift:.1f} px from the regular lattice, which stays "
