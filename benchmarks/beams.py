@@ -27,7 +27,7 @@ from benchmarks.simulated_arrays import RATIOS, Floats, Points, gaussians
 from faintspot.base.errors import InputError
 from faintspot.slopes.sensor.found_layout import FoundLayout, find_layout
 
-NUMBER, SEED = 200, 5000
+NUMBER, SEED = 200, 6000
 MEASURABLE_PX, NEAR = 0.1, 0.3  # px; pitches
 EDGE_FACTORS, FLUX_E, READ_NOISE_E = (3.0, 100.0), (2e3, 5e5), (1.0, 20.0)
 PUPILS = ("free", "disk", "annulus", "one side cut")

@@ -26,7 +26,7 @@ from faintspot.cli import main
 from faintspot.slopes.sensor.pupil import lenslet_outlines, pupil_of
 from faintspot.slopes.wavefront.zernike import mean_gradients
 
-NUMBER, SEED, FRAMES = 36, 7000, 20
+NUMBER, SEED, FRAMES = 30, 7000, 20
 PITCH, WIDTH_PX, LENSLETS_PX, MODES = 20, 1.4, 0.02, 10
 KINDS: dict[str, dict[str, Any]] = {
     "same lenslets, up to 1.5 pitches away": {"reach": 1.5, "same": True},
