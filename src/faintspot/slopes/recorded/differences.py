@@ -52,10 +52,7 @@ def difference(run: StoredRun, other: StoredRun) -> tuple[Slopes, Slopes, list[s
     common["flags"][..., match < 0] = int(SubapertureFlag.NO_FLUX)
     subtracted = Slopes.from_variables(common, keep=keep)
     offsets = np.nan_to_num(their_places[match] - layout.centres - subtracted_reference(run.stored))
-    x, y = (
-        (own_slopes - offset).astype(np.float32)
-        for own_slopes, offset in zip((own.x, own.y), offsets.T, strict=True)
-    )
+    x, y = (own.x - offsets[:, 0]).astype(np.float32), (own.y - offsets[:, 1]).astype(np.float32)
     lost = [
         np.where(are_valid(each.flags, keep).any(axis=0), 0, np.bitwise_or.reduce(each.flags))
         for each in (own, subtracted)
@@ -89,9 +86,9 @@ def _shifted(run: StoredRun, other: StoredRun, layout: Layout, theirs: Layout) -
     lit, index = np.zeros(own.max(axis=0) + 1), np.full(cells.max(axis=0) + 1, -1)
     lit[tuple(own.T)], index[tuple(cells.T)] = 1.0, np.arange(len(cells))
     shared = fftconvolve(index >= 0, lit[::-1, ::-1])
-    turned = abs((theirs.angle_deg - layout.angle_deg + 180) % 360 - 180)
-    scaled = abs(lenslet_pitch(theirs) / lenslet_pitch(layout) - 1)
-    alike = layout.geometry == theirs.geometry and turned < _TURNED_DEG and scaled < _SCALED
+    alike = layout.geometry == theirs.geometry
+    alike &= abs((theirs.angle_deg - layout.angle_deg + 180) % 360 - 180) < _TURNED_DEG
+    alike &= abs(lenslet_pitch(theirs) / lenslet_pitch(layout) - 1) < _SCALED
     if not alike or shared.max() < _LEAST * len(own):
         raise InputError(
             f"{other.path}: expected the {len(layout)} sub-apertures of {run.path}, or most of them in "

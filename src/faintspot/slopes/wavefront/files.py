@@ -43,6 +43,8 @@ def mode_table(wavefront: Wavefront) -> tuple[list[str], list[list[str]]]:
     several, unit = np.count_nonzero(wavefront.fitted) > 1, wavefront.unit
     header = ["Noll", "name", "OSA", f"{'mean' if several else 'value'} ({unit})", "± standard error"]
     digits = _decimals(wavefront.rms_of_frames)
+    if len(wavefront.modes) > 2:  # tilt may be far larger than the others
+        digits = min(digits + 2, _decimals(wavefront.rms_of_frames[2:]))
     rows = []
     for mode, of_frames in zip(mode_records(wavefront), wavefront.rms_of_frames, strict=True):
         numbers = signed(mode["mean"], digits), number_or_dash(mode["standard_error"], digits)

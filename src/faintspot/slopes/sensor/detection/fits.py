@@ -224,10 +224,8 @@ def _illuminated_of(
         reach_px = _ELSEWHERE * lattice.pitch_px
         bright, taken = everywhere.positions[is_bright], spots.positions[lit]
         elsewhere = _away(bright, taken, reach_px)
-        dim = np.concatenate(
-            [everywhere.positions[clear & ~is_bright], _away(dark, everywhere.positions[clear], reach_px)]
-        )
-        dim = _away(dim, taken, reach_px)
+        dark = _away(dark, everywhere.positions[clear], reach_px)
+        dim = _away(np.append(everywhere.positions[clear & ~is_bright], dark), taken, reach_px)
     return LatticeFit(lattice, width_px, spots, illuminated, bright, elsewhere, dim, image.shape)
 
 
