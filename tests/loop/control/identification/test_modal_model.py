@@ -74,6 +74,14 @@ def test_a_modal_loop_of_slopes_in_any_order() -> None:
     assert driven(control, new, matrix, 8) < 0.9 * driven(Integrator(matrix), new, matrix, 8)
 
 
+def test_the_fallback_of_modes_is_the_recorded_integrator() -> None:
+    """Although the replay advises less than its gain of 1.1."""
+    rng = np.random.default_rng(14)
+    control = learn(recorded(*integrated(wandering(rng, 1500), rng, loop_gain=1.1)))
+    assert control.integrator_gain < 1.1 / 1.5
+    assert "fallback" not in control.summary()
+
+
 def test_files(tip_tilt: PredictiveControl, tmp_path: Path) -> None:
     """The controller that is read does the same; so do the exported matrices, without the guard."""
     rows = np.random.default_rng(9).standard_normal((200, 2))

@@ -7,6 +7,6 @@ systems: `recording` (slopes and commands), `cell_order` (of their sub-apertures
 centroid gain), `open_loop` (slopes without the mirror), `controlled_loop` (measured properties),
 `misregistration` (of the mirror), `relearning` (frames of the running loop, and a process that learns from
 them), `learnt_loop` (all of it), `predictive_control` (the controller). Of sensors without geometry:
-`modal_loop` (modes of the interaction matrix), `modal_delay` (delay, gain and law), `modal_model` (a
-predictor of each mode).
+`modal_loop` (modes of the interaction matrix), `modal_delay` (delay, gain and law), `modal_model`
+(predictors of the modes).
 """
