@@ -29,7 +29,7 @@ from faintspot.loop.control.identification.predictive_control import PredictiveC
 from faintspot.loop.control.identification.recording import Recording, prepared
 from faintspot.loop.control.reconstructor import make_reconstructor
 from faintspot.loop.slope_covariance import ARCSEC
-from faintspot.slopes.spots.von_karman import R0_WAVELENGTH_M, SPECTRUM
+from faintspot.slopes.spots.shapes import R0_WAVELENGTH_M, SPECTRUM
 
 Floats = NDArray[np.float64]
 Control = Callable[[Floats], Floats]

@@ -23,7 +23,7 @@ from OOPAO.Telescope import Telescope
 
 import faintspot as fs
 from faintspot.adapters import oopao
-from faintspot.adapters.checks import check_matrix
+from faintspot.adapters.base import check_matrix
 
 FLUX_E, READ_NOISE_E, FRAMES, SETTLE, IMAGING_M = 22.0, 1.0, 160, 40, 1.65e-6
 GAINS = (0.05, 0.1, 0.2, 0.35)

@@ -24,7 +24,7 @@ import yaml
 from pyrtc import clear_shms, open_stream
 from pyrtc.manager import RTCManager
 
-from faintspot.adapters.checks import check_matrix
+from faintspot.adapters.base import check_matrix
 
 BENCH, COMMANDS, RATE_HZ = Path("bench"), 54, 100
 TELESCOPE, ENGINE = "telescope", "engine"

@@ -10,7 +10,7 @@ import faintspot
 SOURCE = Path(faintspot.__file__).parent
 
 OF_THE_PROGRAM = {
-    "adapters/checks.py check_version",
+    "adapters/base.py check_version",
     "adapters/pyrtc.py camera",
     "adapters/pyrtc.py loop",
     "adapters/pyrtc.py slopes_process",

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.foreign.base import Floats
-from faintspot.slopes.spots.von_karman import R0_WAVELENGTH_M, structure_function
+from faintspot.slopes.spots.shapes import R0_WAVELENGTH_M, structure_function
 
 OUTER_SCALE_M = 25.0
 FRAMES = 2000

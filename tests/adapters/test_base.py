@@ -21,8 +21,14 @@ from tests.refusals import refused
 
 import faintspot as fs
 from faintspot import InputError, Settings
-from faintspot.adapters.base import ToolSlopes, parts_of
-from faintspot.adapters.checks import UntestedVersionWarning, check_matrix, check_version, predicted
+from faintspot.adapters.base import (
+    ToolSlopes,
+    UntestedVersionWarning,
+    check_matrix,
+    check_version,
+    parts_of,
+    predicted,
+)
 
 LAYOUT = fs.Layout.stacked(N, (SIDE, SIDE))
 

@@ -12,7 +12,7 @@ from tests.adapters.adapter_cases import EVERYTHING, needs
 
 from faintspot import InputError
 from faintspot.adapters import oopao, pyrtc
-from faintspot.adapters.checks import UntestedVersionWarning, check_version
+from faintspot.adapters.base import UntestedVersionWarning, check_version
 
 pytestmark = pytest.mark.filterwarnings("ignore")
 

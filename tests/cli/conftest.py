@@ -27,6 +27,4 @@ def _undrawn(undrawn_pictures: None) -> None:
 @pytest.fixture
 def no_picture(monkeypatch: pytest.MonkeyPatch) -> None:
     """Draw nothing, which takes most of a second, where the picture is not what is tested."""
-    monkeypatch.setattr(
-        "faintspot.slopes.recorded.layout_picture.layout_picture", lambda *given, **named: None
-    )
+    monkeypatch.setattr("faintspot.slopes.sensor.drawing.layout_picture", lambda *given, **named: None)

@@ -9,7 +9,7 @@ from faintspot.loop.simulation import LoopConfiguration
 from faintspot.loop.simulation.atmosphere import make_atmosphere
 from faintspot.loop.simulation.record import slope_turbulence
 from faintspot.loop.slope_covariance import SlopeTurbulence
-from faintspot.slopes.spots.von_karman import SPECTRUM
+from faintspot.slopes.spots.shapes import SPECTRUM
 
 
 def _variance_of_the_spectrum(side_m: float, outer_scale_m: float) -> float:

@@ -7,8 +7,15 @@ from typing import Any, Unpack
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from faintspot.adapters.base import AdapterOptions, ToolSlopes, largest_window, layout_around, on_detector
-from faintspot.adapters.checks import check_version, predicted
+from faintspot.adapters.base import (
+    AdapterOptions,
+    ToolSlopes,
+    check_version,
+    largest_window,
+    layout_around,
+    on_detector,
+    predicted,
+)
 from faintspot.base.checks import finite_array, number_between
 from faintspot.base.errors import InputError, MissingExtraError
 from faintspot.slopes.camera.calibration import Calibration

@@ -9,8 +9,7 @@ from typing import Any, Unpack
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.adapters.base import AdapterOptions, ToolSlopes
-from faintspot.adapters.checks import check_version, predicted
+from faintspot.adapters.base import AdapterOptions, ToolSlopes, check_version, predicted
 from faintspot.base.errors import InputError
 from faintspot.slopes.camera.calibration import Calibration
 from faintspot.slopes.pipeline.settings import Settings
@@ -35,7 +34,7 @@ class Spots:
     settings, calibration
         See `ToolSlopes`.
     predict : callable or object with `predict`, optional
-        See `faintspot.adapters.checks.predicted`: slopes in the tool's order and unit.
+        See `faintspot.adapters.base.predicted`: slopes in the tool's order and unit.
     rows_first : bool
         Whether the tool puts coordinates along rows (y) before those along columns (x).
     **options

@@ -20,8 +20,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.adapters.base import CALIBRATION_FLUX_E, FLUX_FRAMES, ToolSlopes, layout_around, parts_of
-from faintspot.adapters.checks import check_version
+from faintspot.adapters.base import (
+    CALIBRATION_FLUX_E,
+    FLUX_FRAMES,
+    ToolSlopes,
+    check_version,
+    layout_around,
+    parts_of,
+)
 from faintspot.base.errors import InputError, MissingExtraError
 from faintspot.engine.streams.stream import Follower
 from faintspot.loop.control import PredictiveControl

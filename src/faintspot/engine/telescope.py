@@ -25,7 +25,7 @@ from faintspot.engine.streams.shared_streams import create_stream, held
 from faintspot.loop.simulation.configuration import LoopConfiguration
 from faintspot.loop.simulation.telescope import TelescopeModel, make_detector
 from faintspot.loop.slope_covariance import ARCSEC
-from faintspot.slopes.spots.von_karman import R0_WAVELENGTH_M
+from faintspot.slopes.spots.shapes import R0_WAVELENGTH_M
 
 ORDERS = ("photons", "magnitude", "r0_m", "seeing_arcsec", "wind_factor")
 _FWHM = 0.976  # long-exposure FWHM in units of wavelength / r0, without outer scale (Roddier 1981)

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
-from faintspot.slopes.spots.von_karman import R0_WAVELENGTH_M, structure_function
+from faintspot.slopes.spots.shapes import R0_WAVELENGTH_M, structure_function
 
 Floats = NDArray[np.float64]
 

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.loop.slope_covariance import SlopeTurbulence
-from faintspot.slopes.spots.von_karman import R0_WAVELENGTH_M
+from faintspot.slopes.spots.shapes import R0_WAVELENGTH_M
 
 Floats = NDArray[np.float64]
 

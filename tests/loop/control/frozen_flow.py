@@ -3,7 +3,7 @@
 import numpy as np
 
 from faintspot.loop.slope_covariance import SlopeTurbulence
-from faintspot.slopes.spots.von_karman import R0_WAVELENGTH_M, SPECTRUM
+from faintspot.slopes.spots.shapes import R0_WAVELENGTH_M, SPECTRUM
 
 WAVES = 1500
 

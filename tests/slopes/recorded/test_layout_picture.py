@@ -8,7 +8,7 @@ from tests.shared_data import shared_file
 from tests.slopes.recorded.recorded_cases import sensor, simulated
 
 from faintspot.base.errors import InputError
-from faintspot.slopes.recorded.layout_picture import layout_picture
+from faintspot.slopes.sensor.drawing import layout_picture
 from faintspot.slopes.sensor.layout import Layout
 
 

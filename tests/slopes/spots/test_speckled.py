@@ -13,7 +13,7 @@ from tests.refusals import assert_each_refused
 
 from faintspot.base.errors import InputError
 from faintspot.slopes.simulate import Detector, speckled_spots, spots, subapertures
-from faintspot.slopes.spots.von_karman import structure_function
+from faintspot.slopes.spots.shapes import structure_function
 
 
 def centres_of_gravity(images: NDArray[np.float64]) -> NDArray[np.float64]:

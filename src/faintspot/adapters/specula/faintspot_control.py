@@ -8,7 +8,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.adapters.checks import check_version
+from faintspot.adapters.base import check_version
 from faintspot.adapters.specula.faintspot_slopec import TESTED
 from faintspot.base.checks import number_between
 from faintspot.base.errors import MissingExtraError

@@ -8,8 +8,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.adapters.base import CALIBRATION_FLUX_E, FLUX_FRAMES, AdapterOptions, ToolSlopes, parts_of
-from faintspot.adapters.checks import check_matrix, check_version
+from faintspot.adapters.base import (
+    CALIBRATION_FLUX_E,
+    FLUX_FRAMES,
+    AdapterOptions,
+    ToolSlopes,
+    check_matrix,
+    check_version,
+    parts_of,
+)
 from faintspot.base.errors import InputError, MissingExtraError
 from faintspot.slopes.sensor.layout import Layout
 

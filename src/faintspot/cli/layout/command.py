@@ -275,7 +275,7 @@ def command(
         left_out = np.concatenate([found.outside, found.cut])
         marks = {"outside": left_out, "doubtful": found.clipped | found.unlike}
     if drawing is not None:
-        from faintspot.slopes.recorded.layout_picture import layout_picture
+        from faintspot.slopes.sensor.drawing import layout_picture
 
         layout_picture(np.where(np.isnan(mean), np.nanmedian(mean), mean), layout, drawing, **marks)
     # The layout last: it may be long, and whatever is saved after it reads it again.

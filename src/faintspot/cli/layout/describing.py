@@ -12,7 +12,7 @@ from faintspot.slopes.pipeline.settings import Settings
 from faintspot.slopes.recorded.first_settings import FirstSettings
 from faintspot.slopes.sensor.found_layout import FoundLayout
 from faintspot.slopes.sensor.layout import Layout
-from faintspot.slopes.sensor.stated import reference_in_words
+from faintspot.slopes.sensor.window_checks import reference_in_words
 
 _MOST_NAMED = 12  # sub-apertures in one line
 _LARGE_PX = 0.03  # constant error at the pupil's edge

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from faintspot.base.errors import InputError
 from faintspot.loop.simulation.configuration import LoopConfiguration
-from faintspot.slopes.spots.von_karman import R0_WAVELENGTH_M, SPECTRUM
+from faintspot.slopes.spots.shapes import R0_WAVELENGTH_M, SPECTRUM
 
 Floats = NDArray[np.float32]
 

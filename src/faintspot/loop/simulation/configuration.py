@@ -19,7 +19,7 @@ from faintspot.loop.simulation import sections
 from faintspot.loop.slope_covariance import ARCSEC
 from faintspot.slopes.estimators.sensor import Scene
 from faintspot.slopes.simulate.photometry import Photometry
-from faintspot.slopes.spots.von_karman import R0_WAVELENGTH_M
+from faintspot.slopes.spots.shapes import R0_WAVELENGTH_M
 
 """Radians in one arcsecond."""
 

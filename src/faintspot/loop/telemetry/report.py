@@ -33,7 +33,7 @@ from faintspot.loop.slope_covariance import ARCSEC, SlopeTurbulence
 from faintspot.loop.telemetry.spectra import ModalSpectra, modal_spectra, recorded_discrepancy
 from faintspot.loop.turbulence_strength import differential_image_motion, turbulence_strength
 from faintspot.slopes.sensor.pupil import subapertures_across
-from faintspot.slopes.spots.von_karman import R0_WAVELENGTH_M
+from faintspot.slopes.spots.shapes import R0_WAVELENGTH_M
 
 if TYPE_CHECKING:
     from faintspot.loop.control.identification.learnt_loop import ObservedLoop

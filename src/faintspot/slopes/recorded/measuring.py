@@ -31,7 +31,7 @@ from faintspot.slopes.pipeline.slope_pipeline import SlopePipeline
 from faintspot.slopes.pipeline.slopes import Slopes, layout_coordinates
 from faintspot.slopes.recorded.survey import Survey, configured, frames_apart, response, stretches, survey
 from faintspot.slopes.sensor.layout import Layout
-from faintspot.slopes.sensor.stated import reference_in_words
+from faintspot.slopes.sensor.window_checks import reference_in_words
 
 if TYPE_CHECKING:
     from faintspot.slopes.pipeline.following import SpotFollower

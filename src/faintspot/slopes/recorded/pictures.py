@@ -15,9 +15,8 @@ from faintspot.base.report.texts import Texts, plain_number
 from faintspot.slopes.estimators.base import Step
 from faintspot.slopes.estimators.built_in.total_variation import TotalVariation
 from faintspot.slopes.pipeline.slopes import Slopes, Stages
-from faintspot.slopes.recorded.layout_picture import asinh_stretch
 from faintspot.slopes.recorded.statistics import Jitter, MeasuredSlopes, SlopesSummary
-from faintspot.slopes.sensor.drawing import Arrows, Map, map_height
+from faintspot.slopes.sensor.drawing import Arrows, Map, asinh_stretch, map_height
 from faintspot.slopes.sensor.layout import Layout
 
 Floats = NDArray[np.float64]

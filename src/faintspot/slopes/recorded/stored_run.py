@@ -20,7 +20,7 @@ from faintspot.slopes.estimators.base import Estimator
 from faintspot.slopes.pipeline import configuration
 from faintspot.slopes.pipeline.settings import Settings
 from faintspot.slopes.sensor.layout import Layout
-from faintspot.slopes.sensor.stated import reference_in_words
+from faintspot.slopes.sensor.window_checks import reference_in_words
 from faintspot.slopes.spots.fixed_weights import FixedWeights
 from faintspot.slopes.spots.psf import PSF
 

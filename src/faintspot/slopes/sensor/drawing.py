@@ -1,20 +1,38 @@
-"""Maps of values by sub-aperture, and marks on pictures: outlines and arrows."""
+"""Maps of values by sub-aperture, outlines and arrows on pictures, and the picture of a layout."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from faintspot.base.report.plots import COLOUR_MAP, FLUX_GREY, GREY, WIDTH, Mark, colour_bar
+from faintspot.base.files import write_atomically
+from faintspot.base.report.plots import (
+    COLOUR_MAP,
+    FLUX_GREY,
+    GREY,
+    WIDTH,
+    Labels,
+    Line,
+    Mark,
+    Picture,
+    colour_bar,
+    limits_of,
+    plot,
+    png,
+)
+from faintspot.base.statistics import MAD_TO_STD
 from faintspot.slopes.sensor.layout import Layout
 from faintspot.slopes.sensor.pupil import lenslet_outlines, lenslet_pitch
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.colors import FuncNorm
+
 
 Floats = NDArray[np.float64]
 
@@ -104,3 +122,97 @@ def map_height(layout: Layout, columns: int) -> float:
     """Return the height of a row of maps [inch], as the sensor's shape asks for."""
     width, height = np.ptp(subaperture_shapes(layout).reshape(-1, 2), axis=0)
     return float(min(max(0.8 * WIDTH / max(columns, 2) * height / width, 2.5), 6.5) + 0.6)
+
+
+_WINDOW, _DOUBTFUL = "#E69F00", "#56B4E9"
+_MOST_NUMBERED = 1500
+_MOST_PIXELS = 1400  # a side of the frame; of more, pixels are averaged rather than left out
+_SIDE = 12.0  # inch
+
+
+def layout_picture(
+    frame: ArrayLike,
+    layout: Layout,
+    path: str | Path,
+    *,
+    outside: ArrayLike = (),
+    doubtful: ArrayLike | None = None,
+) -> None:
+    """Write a PNG picture of a frame with the sub-apertures' windows and numbers drawn on it.
+
+    The brightness follows asinh of the flux above the sky, cut at the 99.5th percentile of the windows'
+    pixels, so hot pixels neither hide the spots nor set the scale.
+
+    Parameters
+    ----------
+    frame : (h, w) or (n, h, w) array
+        Several are averaged.
+    layout : Layout
+    path : str or Path
+        Replaced when it exists.
+    outside : (m, 2) array
+        x, y of lit spots that are in no sub-aperture, drawn as circles.
+    doubtful : (n_subapertures,) array of bool, optional
+        Sub-apertures whose windows are drawn in another colour.
+
+    Raises
+    ------
+    InputError
+        When the frame is not of the layout's shape or the file cannot be written.
+    """
+    from matplotlib import patheffects
+
+    array = np.asarray(frame, dtype=np.float64)
+    if array.ndim == 3:
+        array = array.mean(axis=0)
+    n_rows, n_columns = array.shape
+    (height, width), corners = layout.window, layout.corners[:, ::-1] - 0.5
+    points = 72 * _SIDE * 0.85 * width / n_columns  # a window's width in points
+    marked = np.zeros(len(layout), bool) if doubtful is None else np.asarray(doubtful, bool)
+    windows = {
+        "edgecolors": np.where(marked, _DOUBTFUL, _WINDOW),
+        "linewidths": min(max(points / 14, 0.2), 0.9),  # lines never hide the spots
+    }
+    ring = np.array([[0, 0], [width, 0], [width, height], [0, height]])
+    circle = {"ls": "", "marker": "o", "ms": 0.8 * points, "mfc": "none", "mec": _DOUBTFUL}
+    marks: list[Mark] = [
+        Outlines(corners[:, None] + ring, windows),
+        Line.of("", np.reshape(outside, (-1, 2)), circle),
+    ]
+    if points >= 12 and len(layout) <= _MOST_NUMBERED:
+        around = [patheffects.withStroke(linewidth=1.6, foreground="black")]
+        style = {"color": _WINDOW, "fontsize": min(points / 3.0, 13.0), "va": "top", "path_effects": around}
+        places = corners + np.array([0.06 * width, 0.95 * height])
+        marks.append(Labels(places, [str(number) for number in range(len(layout))], style))
+    pitch = "" if layout.pitch_px is None else f", pitch {layout.pitch_px:.2f} px"
+    title = (
+        f"{len(layout)} sub-aperture{'' if len(layout) == 1 else 's'} of {height} x {width} px, "
+        f"{layout.geometry}{pitch}, angle {layout.angle_deg:.2f}°"
+    )
+    style = {
+        "cmap": "gray",
+        "norm": asinh_stretch(array, layout.images(array)),
+        "interpolation": "nearest" if max(array.shape) <= _MOST_PIXELS else "antialiased",
+    }
+    picture = Picture(array, "frame's units", title, style=style, marks=marks)
+    high = min(max(0.9 * _SIDE * n_rows / n_columns, 3.0), 2 * _SIDE) + 0.9
+    figure = plot([[picture]], high, width=_SIDE, legend="")
+    write_atomically(path, png(figure, tight=False))
+
+
+def asinh_stretch(array: Floats, inside: Floats) -> FuncNorm:
+    """Return an asinh stretch around the sky level, in units of its noise; blind to hot and bad pixels."""
+    from matplotlib.colors import FuncNorm
+
+    good = array[np.isfinite(array)]
+    sky = float(np.median(good)) if good.size else 0.0
+    noise = MAD_TO_STD * float(np.median(np.abs(good - sky))) if good.size else 0.0
+    low, high = limits_of(inside, percent=99.5)
+    low, high = min(low, sky - 2 * noise), max(high, sky + 5 * noise)
+    if not high > low:
+        low, high = low - 1.0, low + 1.0
+    # Linear over the noise, logarithmic over the spots; never linear in less than a twentieth of the range.
+    unit = max(3 * noise, 0.05 * (high - low))
+    return FuncNorm(
+        (lambda v: np.arcsinh((v - sky) / unit), lambda u: sky + unit * np.sinh(u)), vmin=low, vmax=high
+    )

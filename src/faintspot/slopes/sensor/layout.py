@@ -297,7 +297,7 @@ class Layout(ConfigurationTable, table="layout"):
             Frame with spots, or several of the same field, which are averaged.
         geometry : {"auto", "square", "hexagonal"}
         pitch_px, angle_deg, centre, fit
-            What is known of the lattice, and used as stated: see `faintspot.slopes.sensor.stated`.
+            What is known of the lattice, and used as stated: see `faintspot.slopes.sensor.window_checks`.
         pixels : int or (int, int), optional
             Window, or its height and width. Default: the largest square windows that do not overlap.
         bad_pixels : (h, w) array of bool, optional

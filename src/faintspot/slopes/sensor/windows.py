@@ -13,8 +13,7 @@ from scipy.spatial import cKDTree
 from faintspot.base.checks import real_array
 from faintspot.base.errors import InputError
 from faintspot.slopes.sensor.detection.lenslets import LensletGrid, find_lenslets
-from faintspot.slopes.sensor.stated import with_stated
-from faintspot.slopes.sensor.window_checks import LARGEST_WINDOW, window_size
+from faintspot.slopes.sensor.window_checks import LARGEST_WINDOW, window_size, with_stated
 
 # Windows may be moved this far from their spots to be a pixel larger: no more than the rounding of their
 # corners to whole pixels.
@@ -84,7 +83,7 @@ def find_windows(
     move_windows : bool
         Whether all windows may be shifted off the spots to include those at the edge of the frame.
     pitch_px, angle_deg, centre, fit
-        What is known of the lattice, see `faintspot.slopes.sensor.stated.with_stated`.
+        What is known of the lattice, see `faintspot.slopes.sensor.window_checks.with_stated`.
     **options
         Passed on to `faintspot.slopes.sensor.detection.lenslets.find_lenslets`.
 

@@ -11,8 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from faintspot.base.checks import finite_array, number_between, numbers_between, one_of, spawn
 from faintspot.base.errors import InputError
-from faintspot.slopes.spots.shapes import SMALLEST_SIZE, image_shape, per_spot
-from faintspot.slopes.spots.von_karman import structure_function
+from faintspot.slopes.spots.shapes import SMALLEST_SIZE, image_shape, per_spot, structure_function
 
 Floats = NDArray[np.float64]
 

@@ -8,11 +8,11 @@ from faintspot.base.errors import lazy_attributes
 
 if TYPE_CHECKING:
     from faintspot.slopes.wavefront.certificate import Certificate as Certificate
+    from faintspot.slopes.wavefront.certificate import Drift as Drift
     from faintspot.slopes.wavefront.certificate import certify as certify
+    from faintspot.slopes.wavefront.certificate import fit_drift as fit_drift
     from faintspot.slopes.wavefront.discrepancy import Discrepancy as Discrepancy
     from faintspot.slopes.wavefront.discrepancy import slope_discrepancy as slope_discrepancy
-    from faintspot.slopes.wavefront.drift import Drift as Drift
-    from faintspot.slopes.wavefront.drift import fit_drift as fit_drift
     from faintspot.slopes.wavefront.files import save_wavefront as save_wavefront
     from faintspot.slopes.wavefront.fit import Wavefront as Wavefront
     from faintspot.slopes.wavefront.fit import fit_wavefront as fit_wavefront
@@ -23,8 +23,8 @@ _HOMES = {
     "Discrepancy": "faintspot.slopes.wavefront.discrepancy",
     "Wavefront": "faintspot.slopes.wavefront.fit",
     "certify": "faintspot.slopes.wavefront.certificate",
-    "Drift": "faintspot.slopes.wavefront.drift",
-    "fit_drift": "faintspot.slopes.wavefront.drift",
+    "Drift": "faintspot.slopes.wavefront.certificate",
+    "fit_drift": "faintspot.slopes.wavefront.certificate",
     "fit_wavefront": "faintspot.slopes.wavefront.fit",
     "save_wavefront": "faintspot.slopes.wavefront.files",
     "slope_discrepancy": "faintspot.slopes.wavefront.discrepancy",

@@ -11,7 +11,7 @@ from faintspot.base.report.plots import GREY, METHOD_COLOURS, Drawing, Line, Pan
 from faintspot.slopes.sensor.drawing import Outlines
 from faintspot.slopes.sensor.layout import Layout
 from faintspot.slopes.sensor.pupil import lenslet_outlines
-from faintspot.slopes.wavefront.drift import Drift
+from faintspot.slopes.wavefront.certificate import Drift
 from faintspot.slopes.wavefront.fit import Wavefront
 from faintspot.slopes.wavefront.zernike import mode_name, osa_index
 

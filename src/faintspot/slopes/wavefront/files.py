@@ -11,8 +11,7 @@ from faintspot.base.files import check_ending, write_atomically
 from faintspot.base.report.texts import NOTHING, Texts, number_or_dash, signed
 from faintspot.base.statistics import Estimate
 from faintspot.base.text_files import to_json
-from faintspot.slopes.wavefront.certificate import Certificate, certify
-from faintspot.slopes.wavefront.drift import Drift
+from faintspot.slopes.wavefront.certificate import Certificate, Drift, certify
 from faintspot.slopes.wavefront.fit import NM, Floats, Wavefront, total
 from faintspot.slopes.wavefront.zernike import mode_name, noll_to_nm, osa_index
 

@@ -1,6 +1,6 @@
 """Prediction of slopes, and its fallback. Read in this order.
 
 `predictor` (second-order autoregression and its Kalman filter), `guarded` (filter and integrator side by
-side), `memory`, `kernels` and `compiled` (the same, compiled). For large sensors, as small ones lose by it:
+side), `kernels` and `compiled` (the same, compiled). For large sensors, as small ones lose by it:
 `local_model`, `local_predictor`, `large_guarded`. Of modes without geometry: `modal_predictor`.
 """

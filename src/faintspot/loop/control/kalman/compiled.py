@@ -17,10 +17,12 @@ from faintspot.loop.control.base import (
 )
 from faintspot.loop.control.integrator import LoopPlant
 from faintspot.loop.control.kalman.guarded import CHOSEN, GuardedController
-from faintspot.loop.control.kalman.kernels import FOLLOW, GO_ON, HOLD, replay
-from faintspot.loop.control.kalman.memory import (
+from faintspot.loop.control.kalman.kernels import (
     COMMAND_ROWS,
+    FOLLOW,
+    GO_ON,
     HELD,
+    HOLD,
     LATEST_PLAIN,
     PREDICTED,
     SLOPE_ROWS,
@@ -29,6 +31,7 @@ from faintspot.loop.control.kalman.memory import (
     Matrices,
     Memory,
     Recorded,
+    replay,
 )
 from faintspot.loop.control.kalman.predictor import SlopePredictor, shares
 

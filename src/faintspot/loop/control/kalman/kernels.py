@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -17,7 +17,6 @@ from faintspot.loop.control import integrator
 from faintspot.loop.control.base import LEAST_SHARE, LEAST_VARIANCE_PX2
 from faintspot.loop.control.integrator import integrate_wavefront
 from faintspot.loop.control.kalman import guarded
-from faintspot.loop.control.kalman import memory as arrays
 from faintspot.loop.control.kalman.guarded import (
     AT_LIMIT,
     BLENDED,
@@ -29,33 +28,93 @@ from faintspot.loop.control.kalman.guarded import (
     SURPRISE,
     choose,
 )
-from faintspot.loop.control.kalman.memory import (
-    COVARIANCE,
-    DIRECTION,
-    FOR_PLAIN,
-    HELD,
-    HELD_LEARNT,
-    HELD_PLAIN,
-    IMAGE,
-    INNOVATION,
-    LATEST_PLAIN,
-    LEFT,
-    LEFT_LEARNT,
-    LEFT_PLAIN,
-    MADE,
-    OFFSET,
-    PREDICTED,
-    SCALE,
-    SOLUTION,
-    SPARE,
-    VARIANCE,
-)
 from faintspot.loop.control.kalman.predictor import LARGEST_VARIANCE_PX2
 from faintspot.slopes.kernels.compiling import Direct, _kernel
 from faintspot.slopes.kernels.products import add_products
 
-# Compiled anew when guard, integrator or rows of memory change, too.
-_SOURCES = __file__, guarded.__file__, integrator.__file__, arrays.__file__
+# Rows of memory: of slopes, and of commands; the first four are commands and what they add to slopes.
+HELD, HELD_LEARNT, HELD_PLAIN, LATEST_PLAIN, LEFT_LEARNT, LEFT_PLAIN, FOR_PLAIN = range(7)
+VARIANCE, COVARIANCE, SCALE, INNOVATION, SOLUTION, DIRECTION, IMAGE, SPARE, PREDICTED = range(7, 16)
+SLOPE_ROWS = 16
+MADE, LEFT, OFFSET = 4, 5, 7
+COMMAND_ROWS = 8
+
+
+class Matrices(NamedTuple):
+    """Constant matrices, transposed so that the terms of a sum are adjacent in memory."""
+
+    interaction: Any
+    """(commands, m)"""
+    reconstruct: object
+    """(m, commands)"""
+    phase: Any
+    """(m, commands)"""
+    covariance: Any
+    """(m, states): covariance of the errors of slopes and state before a measurement."""
+    uncertainty: object
+    """(m, m): covariance of the slopes' error."""
+    usual_inverse: object
+    """(m, m): inverse of the slopes' covariance with their usual noise."""
+    usual_variance: Any
+    """(m,): diagonal of that covariance."""
+    onward: Any
+    """(layers, 2 m, m)"""
+    command: Any
+    """(states, commands): matrix from the state to commands."""
+
+
+class Lines(NamedTuple):
+    """Delayed commands: of the mirror, and of both controllers."""
+
+    true: Any
+    """(delay + 1, commands)"""
+    learnt: Any
+    plain: Any
+
+
+class Memory(NamedTuple):
+    """State that persists between frames, and work arrays."""
+
+    state: Any
+    """(layers, 2, m): predicted state of the next frame."""
+    guard: Any
+    """(GUARD_NUMBERS,)"""
+    slopes: Any
+    """(SLOPE_ROWS, m)"""
+    commands: Any
+    """(COMMAND_ROWS, commands)"""
+
+
+class Frame(NamedTuple):
+    """Slopes of a frame, which are finite, and their noise."""
+
+    slopes: Any
+    """(m,) float64"""
+    errors: Any
+    """(m,) float64; infinite: not measured."""
+    covariance: Any
+    """(m / 2,) float64: covariances of the noise of x and y."""
+    prior_std: Any
+    """(m,) or (0,) float64: prior of the estimator; none."""
+    noise_factor: float
+    """Of the errors' variances."""
+
+
+class Recorded(NamedTuple):
+    """Recorded frames; see `OpenLoopTelemetry`."""
+
+    open_loop: Any
+    """(frames, m) float64"""
+    variance: Any
+    """(frames, m) float64"""
+    covariance: Any
+    """(frames, m / 2) float64"""
+    trust: Any
+    """(frames, m) float64"""
+
+
+# Compiled anew when guard or integrator change, too.
+_SOURCES = __file__, guarded.__file__, integrator.__file__
 _compiled = partial(_kernel, sources=tuple(map(Path, _SOURCES)))
 
 
