@@ -22,15 +22,15 @@ from numpy.typing import NDArray
 from benchmarks.measuring import Candidate, Row, Table, best, interleaved, pinned
 from benchmarks.prediction import TELEMETRY_GAIN, Case
 from faintspot.loop.control.base import CommandDelayLine, Controller
-from faintspot.loop.control.identification.controlled_loop import LoopOfControl
 from faintspot.loop.control.identification.learning import learn_controller, relearn
+from faintspot.loop.control.identification.modal_model import LoopOfControl
 from faintspot.loop.control.identification.model import Kalman
 from faintspot.loop.control.identification.predictive_control import PredictiveControl
 from faintspot.loop.control.integrator import CompiledIntegrator, LoopPlant
 from faintspot.loop.control.kalman.compiled import CompiledKalman, Predictive
-from faintspot.loop.control.kalman.large_guarded import LargeGuarded
 from faintspot.loop.control.kalman.local_model import neighbours_within
 from faintspot.loop.control.kalman.local_predictor import local_shapes
+from faintspot.loop.control.kalman.modal_predictor import LargeGuarded
 from faintspot.loop.control.kalman.predictor import SlopeModel, SlopePredictor
 from faintspot.loop.control.reconstructor import Reconstructor
 from faintspot.loop.simulation import load_loop

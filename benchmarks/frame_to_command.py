@@ -42,7 +42,7 @@ from faintspot.engine.timing import Latencies
 from faintspot.loop.control import integrator
 from faintspot.loop.control.base import CommandDelayLine, Controller
 from faintspot.loop.control.configuration import Control
-from faintspot.loop.control.kalman.large_guarded import LargeGuarded
+from faintspot.loop.control.kalman.modal_predictor import LargeGuarded
 from faintspot.loop.control.options import ControlOptions
 from faintspot.loop.control.reconstructor import Reconstructor
 

@@ -21,14 +21,13 @@ import faintspot as fs
 from benchmarks.measuring import Row, Table
 from benchmarks.prediction import Make, rivals
 from faintspot.base.statistics import mean_by_blocks
-from faintspot.loop.control.base import OpenLoopTelemetry
+from faintspot.loop.control.base import OpenLoopTelemetry, replayed_frames
 from faintspot.loop.control.identification.learning import GAINS
 from faintspot.loop.control.identification.loop_delay import LoopDelay
 from faintspot.loop.control.identification.open_loop import open_loop_of
 from faintspot.loop.control.identification.recording import Recording
 from faintspot.loop.control.integrator import LoopPlant
 from faintspot.loop.control.reconstructor import make_reconstructor
-from faintspot.loop.control.replay import replayed_frames
 from faintspot.loop.slope_covariance import ARCSEC
 
 Floats = NDArray[np.float64]

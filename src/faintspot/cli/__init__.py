@@ -35,7 +35,6 @@ _COMMANDS = {
 _HOMES = {
     "estimators": "tune:list_estimators",
     "export": "report:export",
-    "layout": "layout.command:command",
     "live": "realtime.run:live",
     "loop": "study:loop_group",
 }

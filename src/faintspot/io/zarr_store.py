@@ -16,8 +16,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.base import files
 from faintspot.base.errors import InputError, load_zarr
+from faintspot.base.files import (
+    MOST_TEXT_BYTES,
+    check_bytes,
+    check_file_size,
+    read_bytes,
+    replace_file,
+    sync_file,
+    sync_folder,
+)
 from faintspot.base.text_files import parse_json, to_json
 from faintspot.io.stored_array import MOST_WHOLE_BYTES, one_line
 
@@ -141,9 +149,9 @@ def new_store(path: Path, attributes: Mapping[str, Any]) -> Iterator[Any]:
     hidden.mkdir()
     yield load_zarr().create_group(str(hidden), zarr_format=3, attributes=dict(attributes))
     for file in (*hidden.rglob("*"), hidden):
-        (files.sync_folder if file.is_dir() else files.sync_file)(file)
+        (sync_folder if file.is_dir() else sync_file)(file)
     hidden.rename(path)
-    files.sync_folder(path.parent)
+    sync_folder(path.parent)
 
 
 def check_array(name: str, array: Any) -> int:
@@ -157,7 +165,7 @@ def check_array(name: str, array: Any) -> int:
     codecs = _codecs(array)
     if "pickle" in codecs:
         raise InputError(f"{name}: expected numbers, got Python objects, which are never unpickled")
-    files.check_bytes(name, math.prod(array.chunks) * array.dtype.itemsize, MOST_WHOLE_BYTES, "a chunk")
+    check_bytes(name, math.prod(array.chunks) * array.dtype.itemsize, MOST_WHOLE_BYTES, "a chunk")
     return sum(codec in _COMPRESSIONS.values() for codec in codecs)
 
 
@@ -194,7 +202,7 @@ class CheckedChunks:
         if not file.is_file():
             return
         most = math.prod(self._sides) * self._array.dtype.itemsize
-        size = files.check_file_size(file, "a chunk", most + most // 8 + _SPARE_BYTES)
+        size = check_file_size(file, "a chunk", most + most // 8 + _SPARE_BYTES)
         if self._codec and not self._array.shards and not is_surely_small(size, self._codec):
             check_inflated(self._name, file.read_bytes(), self._codec)
 
@@ -207,7 +215,7 @@ def stored_attributes(path: Path) -> dict[str, object]:
     OSError, ValueError, KeyError, TypeError
         When it is not a group of format 3.
     """
-    text = files.read_bytes(path / "zarr.json", "metadata", files.MOST_TEXT_BYTES)
+    text = read_bytes(path / "zarr.json", "metadata", MOST_TEXT_BYTES)
     attributes: dict[str, object] = parse_json(text)["attributes"]
     return attributes
 
@@ -224,7 +232,7 @@ def replace_attributes(path: Path, changed: Mapping[str, object]) -> None:
     """Replace attributes of a group in one step, which the store's own setter does not guarantee."""
     metadata = parse_json((path / "zarr.json").read_text(encoding="utf-8"))
     metadata["attributes"].update(changed)
-    files.replace_file(path / "zarr.json", to_json(metadata, indent=2))
+    replace_file(path / "zarr.json", to_json(metadata, indent=2))
 
 
 def checked_codecs() -> tuple[Any, ...]:

@@ -19,8 +19,8 @@ from tests.loop.control.naive_guarded import Guarded
 from faintspot.loop.control.base import CommandDelayLine
 from faintspot.loop.control.integrator import CompiledIntegrator
 from faintspot.loop.control.kalman.compiled import CompiledKalman, Predictive
-from faintspot.loop.control.kalman.large_guarded import LargeGuarded
 from faintspot.loop.control.kalman.local_predictor import local_filter
+from faintspot.loop.control.kalman.modal_predictor import LargeGuarded
 from faintspot.loop.control.kalman.predictor import SlopePredictor
 
 M, COMMANDS = INTERACTION.shape

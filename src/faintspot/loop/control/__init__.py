@@ -1,7 +1,7 @@
 """Controllers that turn slopes into mirror commands, independent of any simulation. Read in this order.
 
-`base` (delay line to the mirror, what every controller offers, open-loop slopes), `reconstructor` (slopes
-to commands), `integrator` (and the loop for which controllers are made), `replay`, `kalman`
+`base` (delay line to the mirror, what every controller offers, open-loop slopes and their replay),
+`reconstructor` (slopes to commands), `integrator` (and the loop for which controllers are made), `kalman`
 (prediction), `identification` (controllers learnt from telemetry), `options` and `configuration` (table
 [control]). Beside them: `mirror_calibration`, from pokes, and `flattening`, the command that flattens a
 measured wavefront.

@@ -16,9 +16,11 @@ from faintspot.loop.control.base import (
     Controller,
     ExpectedSlopes,
     OpenLoopTelemetry,
+    mean_residual,
+    replayed_frames,
+    replayed_integrators,
 )
 from faintspot.loop.control.reconstructor import Reconstructor
-from faintspot.loop.control.replay import mean_residual, replayed_frames, replayed_integrators
 from faintspot.slopes.kernels.compiling import Direct, compiled_with
 from faintspot.slopes.kernels.products import (
     ProductMemory,

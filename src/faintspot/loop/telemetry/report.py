@@ -15,7 +15,7 @@ from faintspot.base.errors import InputError
 from faintspot.base.report.texts import Texts
 from faintspot.loop.control.identification.layers import Identification, Identified
 from faintspot.loop.control.identification.loop_delay import FEWEST_SUBAPERTURES, LoopDelay
-from faintspot.loop.control.identification.modal_loop import modes_of
+from faintspot.loop.control.identification.modal_delay import modes_of
 from faintspot.loop.control.identification.open_loop import (
     R0,
     Measured,

@@ -8,8 +8,8 @@ from tests.loop.control.frozen_flow import frozen_slopes
 from tests.loop.telemetry.loop_cases import AIR, CELLS, CORNERS, NOISE_PX, RATE_HZ
 
 from faintspot.base.errors import InputError
-from faintspot.loop.control.identification.cell_order import order_remark, smoothness
 from faintspot.loop.control.identification.recording import Recording, prepared
+from faintspot.loop.slope_covariance import order_remark, smoothness
 
 APART = CORNERS - CELLS[:, None]
 INSIDE = ((APART == 0) | (APART == 1)).all(axis=2)

@@ -10,7 +10,7 @@ from tests.loop.control.modal_cases import NOISE, Floats, integrated, recorded, 
 
 from faintspot.base.errors import InputError
 from faintspot.loop.control.base import CommandDelayLine
-from faintspot.loop.control.identification.modal_loop import spectra_of_modes
+from faintspot.loop.control.identification.modal_delay import spectra_of_modes
 from faintspot.loop.control.identification.modal_model import coupling
 from faintspot.loop.control.identification.predictive_control import PredictiveControl, learn
 from faintspot.loop.control.kalman.modal_predictor import LAGS, modal_filter

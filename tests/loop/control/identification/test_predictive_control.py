@@ -12,7 +12,7 @@ from tests.loop.telemetry.loop_cases import recorded
 from faintspot.base.errors import InputError
 from faintspot.loop.control.base import CommandDelayLine
 from faintspot.loop.control.identification import predictive_control
-from faintspot.loop.control.identification.controlled_loop import LoopOfControl
+from faintspot.loop.control.identification.modal_model import LoopOfControl
 from faintspot.loop.control.identification.model import Kalman
 from faintspot.loop.control.identification.predictive_control import PredictiveControl, learn
 from faintspot.loop.control.identification.recording import Recording

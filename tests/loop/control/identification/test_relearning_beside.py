@@ -11,13 +11,13 @@ from tests.loop.telemetry.loop_cases import AIR, NOISE_PX, RATE_HZ, recorded
 
 from faintspot.base.errors import InputError
 from faintspot.loop.control.base import OpenLoopTelemetry
-from faintspot.loop.control.identification.predictive_control import PredictiveControl, learn
-from faintspot.loop.control.identification.relearning import (
+from faintspot.loop.control.identification.learning import (
     FRAMES,
     BesideTheLoop,
     RecentFrames,
     replayed_slopes,
 )
+from faintspot.loop.control.identification.predictive_control import PredictiveControl, learn
 
 
 def test_the_latest_frames_are_kept_in_order() -> None:

@@ -20,8 +20,8 @@ from faintspot.loop.control import integrator
 from faintspot.loop.control.base import CommandDelayLine
 from faintspot.loop.control.kalman.compiled import Predictive
 from faintspot.loop.control.kalman.guarded import EXCESS, MOST_EXCESS, GuardedController
-from faintspot.loop.control.kalman.large_guarded import LargeGuarded
 from faintspot.loop.control.kalman.local_predictor import LocalPredictor, local_filter
+from faintspot.loop.control.kalman.modal_predictor import LargeGuarded
 from faintspot.slopes.kernels.products import add_slopes
 
 M, COMMANDS = INTERACTION.shape

@@ -9,13 +9,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.errors import InputError
-from faintspot.loop.control.identification.controlled_loop import LoopInModes, LoopOfControl
 from faintspot.loop.control.identification.layers import Identification, Identified
 from faintspot.loop.control.identification.learning import learn_controller
 from faintspot.loop.control.identification.loop_delay import FEWEST_SUBAPERTURES, LoopDelay
 from faintspot.loop.control.identification.misregistration import MovableMatrix, misregistration
-from faintspot.loop.control.identification.modal_loop import modes_of
-from faintspot.loop.control.identification.modal_model import learn_modes, share_of_modes
+from faintspot.loop.control.identification.modal_delay import modes_of
+from faintspot.loop.control.identification.modal_model import (
+    LoopInModes,
+    LoopOfControl,
+    learn_modes,
+    share_of_modes,
+)
 from faintspot.loop.control.identification.model import Kalman
 from faintspot.loop.control.identification.open_loop import (
     OpenLoop,

@@ -22,18 +22,17 @@ from faintspot.loop.control.base import (
     KALMAN,
     CommandDelayLine,
     OpenLoopTelemetry,
+    mean_residual,
     usual_noise,
 )
 from faintspot.loop.control.integrator import LoopPlant, settled
 from faintspot.loop.control.kalman.compiled import CompiledKalman, Predictive
 from faintspot.loop.control.kalman.guarded import GuardedController
-from faintspot.loop.control.kalman.large_guarded import LargeGuarded
 from faintspot.loop.control.kalman.local_model import STEPS, slopes_ahead, state_of_state, state_of_surprise
 from faintspot.loop.control.kalman.local_predictor import LocalPredictor, local_filter, local_shapes
 from faintspot.loop.control.kalman.modal_predictor import ARRAYS as MODAL
-from faintspot.loop.control.kalman.modal_predictor import ModalPredictor, modal_shapes
+from faintspot.loop.control.kalman.modal_predictor import LargeGuarded, ModalPredictor, modal_shapes
 from faintspot.loop.control.kalman.predictor import MOST_SLOPES, SlopeModel, SlopePredictor, steady_covariance
-from faintspot.loop.control.replay import mean_residual
 
 if TYPE_CHECKING:
     from faintspot.loop.control.identification.layers import Identified

@@ -20,8 +20,7 @@ from faintspot.loop.control.identification.loop_delay import (
     LoopDelay,
     with_axes,
 )
-from faintspot.loop.control.identification.modal_delay import ModalFits
-from faintspot.loop.control.identification.modal_loop import plateau
+from faintspot.loop.control.identification.modal_delay import ModalFits, plateau
 from faintspot.loop.control.identification.recording import Recording
 from faintspot.loop.slope_covariance import ARCSEC, SlopeTurbulence
 from faintspot.loop.turbulence_strength import OUTER_SCALE_M, TurbulenceStrength

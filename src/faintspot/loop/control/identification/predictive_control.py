@@ -16,9 +16,19 @@ from faintspot.base.checks import one_of, real_array
 from faintspot.base.errors import InputError
 from faintspot.base.files import read_arrays
 from faintspot.loop.control.base import SETTLE_FRAMES, CommandDelayLine
-from faintspot.loop.control.identification.controlled_loop import LoopOfControl
 from faintspot.loop.control.identification.layers import Identified
-from faintspot.loop.control.identification.learning import JUDGED_PART, STANDARD_ERRORS, error_of_mean
+from faintspot.loop.control.identification.learning import (
+    FRAMES,
+    JUDGED_PART,
+    STANDARD_ERRORS,
+    STORED,
+    BesideTheLoop,
+    RecentFrames,
+    error_of_mean,
+    replayed_slopes,
+    restored,
+    stored,
+)
 from faintspot.loop.control.identification.learnt_loop import (
     ObservedLoop,
     learn_loop,
@@ -26,19 +36,11 @@ from faintspot.loop.control.identification.learnt_loop import (
     learn_winds_again,
 )
 from faintspot.loop.control.identification.loop_delay import LoopDelay
-from faintspot.loop.control.identification.modal_loop import LEAST_MEASURED
+from faintspot.loop.control.identification.modal_delay import LEAST_MEASURED
+from faintspot.loop.control.identification.modal_model import LoopOfControl
 from faintspot.loop.control.identification.model import Kalman, state_space, write_matrices
 from faintspot.loop.control.identification.open_loop import Measured, Wind, open_loop_of
 from faintspot.loop.control.identification.recording import Recording
-from faintspot.loop.control.identification.relearning import (
-    FRAMES,
-    STORED,
-    BesideTheLoop,
-    RecentFrames,
-    replayed_slopes,
-    restored,
-    stored,
-)
 
 Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]

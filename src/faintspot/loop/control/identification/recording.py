@@ -20,8 +20,8 @@ from faintspot.base.checks import (
 from faintspot.base.errors import InputError
 from faintspot.base.options import Option
 from faintspot.loop.control.faults import followers, still_actuators, stuck_slopes
-from faintspot.loop.control.identification.cell_order import modes_of_turbulence, order_remark
 from faintspot.loop.control.reconstructor import make_reconstructor
+from faintspot.loop.slope_covariance import modes_of_turbulence, order_remark
 
 Floats = NDArray[np.float64]
 

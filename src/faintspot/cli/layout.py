@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from faintspot.base.errors import DoubtWarning, InputError
 from faintspot.base.tables import save_tables
+from faintspot.cli import layout_options
 from faintspot.cli.commands import (
     KEY,
     NAMES,
@@ -27,8 +28,7 @@ from faintspot.cli.commands import (
     option,
     suggested_slopes,
 )
-from faintspot.cli.layout import options as layout_options
-from faintspot.cli.layout.completing import (
+from faintspot.cli.layout_completing import (
     clearer_frame,
     completed,
     describe_grid,
@@ -36,8 +36,7 @@ from faintspot.cli.layout.completing import (
     measured_darks,
     with_measured_pixels,
 )
-from faintspot.cli.layout.describing import describe, describe_settings, doubts_of
-from faintspot.cli.layout.options import plain
+from faintspot.cli.layout_options import describe, describe_settings, doubts_of, plain
 from faintspot.cli.output import picture_file
 from faintspot.io.frames import FrameSource, open_frames
 from faintspot.slopes.camera.calibration import Calibration, binned

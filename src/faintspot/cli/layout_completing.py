@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from faintspot.base.errors import InputError
 from faintspot.base.statistics import MAD_TO_STD
+from faintspot.cli import layout_options
 from faintspot.cli.commands import errors_of_options, flag_of
-from faintspot.cli.layout import options as layout_options
-from faintspot.cli.layout.options import is_number, plain
+from faintspot.cli.layout_options import is_number, plain
 from faintspot.io.frames import open_frames
 from faintspot.slopes.camera.calibration import Calibration
 from faintspot.slopes.camera.dark_frames import FEWEST_FRAMES, DarkPixels
