@@ -48,6 +48,7 @@ _ORDER = (
     "wavefronts",
     "metrology",
     "beams",
+    "spot_widths",
     "yardstick",
     "startup",
     "loaded",
@@ -65,6 +66,7 @@ LONG = {
     "wavefronts",
     "metrology",
     "beams",
+    "spot_widths",
     "yardstick",
 }
 """Run only when named, or with --full: 5 minutes to an hour each, one with a recording of its own."""
