@@ -1,4 +1,4 @@
-"""The command line: one thin file a command."""
+"""The command line: thin modules, of one command or a few that belong together."""
 
 from __future__ import annotations
 
