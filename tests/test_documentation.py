@@ -142,7 +142,7 @@ def write_night(path: Path, layout: fs.Layout) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("page", blocks())
-def test_blocks_run(page: Path, names: dict[str, Any]) -> None:
+def test_blocks_of_pages_run(page: Path, names: dict[str, Any]) -> None:
     for number, code in enumerate(BLOCK.findall(page.read_text(encoding="utf-8"))):
         compiled = compile(code, f"{page.name}, block {number}", "exec")  # also what is not run is Python
         if not any(mark in code for mark in NOT_RUN):

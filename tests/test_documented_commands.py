@@ -118,7 +118,7 @@ def run(words: list[str]) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("called", pages_to_run())
-def test_commands_run(
+def test_documented_commands_run(
     called: list[list[str]],
     recorded: Path,
     tmp_path: Path,

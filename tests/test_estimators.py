@@ -38,7 +38,7 @@ class TestAgainstOracle:
     @pytest.mark.parametrize("estimator", QUICK)
     @given(seed=SEEDS)
     @examples(6)
-    def test_random_spots(self, estimator: str, seed: int) -> None:
+    def test_random_spots_equal_the_oracle(self, estimator: str, seed: int) -> None:
         case = random_case(seed, estimator)
         assert_equals_oracle(case, case.measure())
 
@@ -94,7 +94,7 @@ class TestAgainstOracle:
 
     @pytest.mark.parametrize("estimator", ["ml", "weighted", "window", "brightest"])
     @pytest.mark.parametrize("window", [(2, 2), (3, 5), (5, 17), (20, 24)])
-    def test_any_window(self, estimator: str, window: tuple[int, int]) -> None:
+    def test_any_window_equals_the_oracle(self, estimator: str, window: tuple[int, int]) -> None:
         case = random_case(11, estimator, n=6, window=window)
         assert assert_equals_oracle(case, case.measure()) > 2
 
@@ -229,7 +229,7 @@ class TestNoiseMap:
             np.testing.assert_allclose(table[:, s], own[:, s], rtol=1e-6)
 
     @pytest.mark.slow
-    def test_hostile_maps(self) -> None:
+    def test_hostile_noise_maps_give_sane_slopes(self) -> None:
         """Noiseless, noisier than any camera, and all pixels but one bad."""
         for estimator in estimators():
             case = random_case(24, estimator, n=3, window=(6, 7))

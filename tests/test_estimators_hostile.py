@@ -79,7 +79,7 @@ class TestImages:
     @EVERY
     @given(seed=SEEDS)
     @examples(8)
-    def test_hostile_images(self, estimator: str, seed: int) -> None:
+    def test_hostile_images_give_sane_slopes(self, estimator: str, seed: int) -> None:
         case = random_case(seed, estimator)
         rng = np.random.default_rng(seed)
         images = hostile_images(rng, case.images.shape)
@@ -168,7 +168,7 @@ class TestSettings:
     @EVERY
     @given(seed=SEEDS)
     @examples(8)
-    def test_extreme_settings(self, estimator: str, seed: int) -> None:
+    def test_extreme_settings_give_sane_slopes(self, estimator: str, seed: int) -> None:
         rng = np.random.default_rng(seed)
         case = random_case(seed, estimator, n=6)
 
@@ -246,7 +246,7 @@ class TestRefused:
     IMAGES = np.ones((3, 8, 8), np.float32)
     NOISE = fs.Calibration(dark=0.0, read_noise_e=1.0)
 
-    def test_bad_settings(self) -> None:
+    def test_settings_out_of_range_are_refused(self) -> None:
         assert_each_refused(fs.Settings, estimator=["centre", 3])
         bad: dict[str, list[Any]] = {
             "steps": [0, 2.5, 101],
@@ -269,7 +269,7 @@ class TestRefused:
             own: dict[str, Any] = {"noise_std": 1.0} if whose == "tv" and name != "noise_std" else {}
             assert_each_refused(partial(fs.Settings, whose, **own), **{name: values})
 
-    def test_bad_calibration(self) -> None:
+    def test_calibration_out_of_range_is_refused(self) -> None:
         values = [-1.0, np.nan, np.inf, "low", [1.0, 2.0]]
         assert_each_refused(fs.Calibration, read_noise_e=values, background_e=values)
 

@@ -25,7 +25,7 @@ def test_version_has_three_numbers() -> None:
     assert faintspot.__version__.count(".") == 2
 
 
-def test_unknown_name() -> None:
+def test_unknown_public_name_is_an_attribute_error() -> None:
     with pytest.raises(AttributeError, match="nothing_like_this"):
         _ = faintspot.nothing_like_this
 

@@ -165,7 +165,7 @@ def test_a_prior_draws_slopes_towards_it() -> None:
         ({"psf": None}, "psf"),
     ],
 )
-def test_refused_options(options: dict[str, Any], message: str) -> None:
+def test_options_that_an_estimator_lacks_are_refused(options: dict[str, Any], message: str) -> None:
     with pytest.raises(InputError, match=message):
         tool(Settings("ml"), **options)
 

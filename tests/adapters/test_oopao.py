@@ -134,7 +134,7 @@ def test_sources_with_other_numbers_of_subapertures() -> None:
     np.testing.assert_allclose(signal(wfs, images())[:, :4], signal(wfs, images(), 1), atol=1e-6)
 
 
-def test_detach() -> None:
+def test_detached_sensor_computes_its_own_slopes_again() -> None:
     wfs = StandIn()
     attached = oopao.attach(wfs, EVERYTHING)
     wfs.initialize_wfs = lambda: None  # type: ignore[method-assign]

@@ -35,12 +35,12 @@ def said_once(make: Callable[[], Any], tool: str, version: str, tested: str) -> 
     assert re.match(f"{tool} {version}: .* tested with {tested}; compare", said[0])
 
 
-def test_oopao_version(version: str) -> None:
+def test_untested_oopao_version_warns_once(version: str) -> None:
     said_once(lambda: oopao.attach(test_oopao.StandIn(), EVERYTHING), "OOPAO", version, oopao.TESTED)
 
 
 @needs("pyrtc", "pyrtc")
-def test_pyrtc_version(version: str) -> None:
+def test_untested_pyrtc_version_warns_once(version: str) -> None:
     def make() -> None:
         pyrtc.slopes_process.cache_clear()
         pyrtc.camera.cache_clear()
@@ -53,7 +53,7 @@ def test_pyrtc_version(version: str) -> None:
 
 
 @needs("hcipy", "loop")
-def test_hcipy_version(version: str) -> None:
+def test_untested_hcipy_version_warns_once(version: str) -> None:
     from faintspot.adapters import hcipy
 
     def make() -> None:
@@ -64,7 +64,7 @@ def test_hcipy_version(version: str) -> None:
 
 
 @needs("specula", "specula")
-def test_specula_version(version: str) -> None:
+def test_untested_specula_version_warns_once(version: str) -> None:
     import specula
 
     specula.init(-1, precision=1)

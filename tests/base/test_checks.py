@@ -10,7 +10,7 @@ from faintspot.base import checks
 
 class TestRealArray:
     @pytest.mark.parametrize("dtype", ["i1", "u8", ">i4", "f2", ">f8", "f4", "g"])
-    def test_keeps_dtype(self, dtype: str) -> None:
+    def test_real_array_is_returned_without_a_copy(self, dtype: str) -> None:
         array = np.ones((2, 2), dtype)
         assert checks.real_array("value", array) is array
 
@@ -72,7 +72,7 @@ class TestImageStack:
             assert checks.image_stack("images", np.full((2, 2), value))[0, 0] == float(value)
 
     @pytest.mark.parametrize(("bad", "words"), BAD_IMAGES)
-    def test_bad(self, bad: Any, words: str) -> None:
+    def test_image_stacks_of_wrong_values_are_refused(self, bad: Any, words: str) -> None:
         with refused("images", words):
             checks.image_stack("images", bad)
 
@@ -89,25 +89,25 @@ class TestNumbers:
         with refused("value = 3", "up to 2"):
             checks.number_between("value", 3, high=2.0)
 
-    def test_whole_numbers(self) -> None:
+    def test_integers_are_whole_numbers_of_any_type(self) -> None:
         result = checks.numbers_between("value", [1.0, 2.0], integer=True)
         assert result.dtype == np.int64
         assert checks.number_between("value", np.uint8(7), integer=True) == 7.0
         with refused("value = 2.5", "whole number"):
             checks.numbers_between("value", [1, 2.5], integer=True)
 
-    def test_one_number(self) -> None:
+    def test_arrays_are_not_one_number(self) -> None:
         for bad in ([1.0], [[1.0]], [1.0, 2.0]):
             with refused("value", "one number"):
                 checks.number_between("value", bad)
 
     @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, "1", None, 1j, [], {}, [[1], [1, 2]]])
-    def test_bad(self, bad: Any) -> None:
+    def test_numbers_that_are_none_are_refused(self, bad: Any) -> None:
         with refused("value"):
             checks.number_between("value", bad)
 
 
-def test_one_of() -> None:
+def test_one_of_returns_known_values_and_refuses_others() -> None:
     assert checks.one_of("colour", "red", ["red", "green"]) == "red"
     for bad in ("blue", None, 1, ["red"], "", "Red"):
         with refused("colour", "'red', 'green'"):

@@ -27,7 +27,7 @@ def test_line_counts_whole_subapertures_and_single_slopes(
     np.testing.assert_array_equal(valid, are_valid(flags, keep))
 
 
-def test_other_causes() -> None:
+def test_other_causes_are_left_out_and_counted() -> None:
     cut = np.array([False, False, True, False])
     valid, line = leave_out(FLAGS, others={"outside the pupil": cut})
     assert line == "left out 2 of 4 sub-apertures, 1 slope of others: dark, outside the pupil, limited"

@@ -77,7 +77,7 @@ class TestOneValue:
             ("kind", {"kind": PerSubaperture("x", {1: "y"})}),
         ],
     )
-    def test_refused(self, words: str, changes: dict[str, Any]) -> None:
+    def test_wrong_values_are_refused(self, words: str, changes: dict[str, Any]) -> None:
         with refused(words):
             Sample(**changes)
 
@@ -116,7 +116,7 @@ class TestEachSubaperture:
             ("arrays of one length, got number 2, above 3", {"number": [1, 2], "above": [1, 2, 3]}),
         ],
     )
-    def test_refused(self, words: str, changes: dict[str, Any]) -> None:
+    def test_wrong_values_are_refused(self, words: str, changes: dict[str, Any]) -> None:
         with refused(words):
             Sample(**changes)
 
@@ -136,7 +136,7 @@ class TestValues:
         assert not is_auto(Sample(found=[1.0]).found)
         assert math.isnan(Sample().default_of("number", 16))
 
-    def test_another_sensor(self) -> None:
+    def test_values_of_another_sensor_are_refused(self) -> None:
         with refused("number: expected 3 values, one per sub-aperture, got 2"):
             Sample(number=[1, 2]).values("number", 3, 16)
         with refused("number: sub-aperture 3 does not exist; there are 3"):
@@ -144,7 +144,7 @@ class TestValues:
 
 
 class TestChanges:
-    def test_some_places(self) -> None:
+    def test_some_subapertures_are_replaced(self) -> None:
         for where in ([1], (1,), np.array([1])):
             assert Sample().replaced({"number": 3.0}, where).values("number", 3, 16).tolist() == [1, 3, 1]
         each = Sample().replaced({"number": [3.0, 4.0]}, np.array([True, False, True]))
@@ -165,7 +165,7 @@ class TestChanges:
             ("where", {"number": 1.0}, "all"),
         ],
     )
-    def test_refused(self, words: str, changes: dict[str, Any], where: Any) -> None:
+    def test_wrong_replacements_are_refused(self, words: str, changes: dict[str, Any], where: Any) -> None:
         with refused(words):
             Sample().replaced(changes, where)
 

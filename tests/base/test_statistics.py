@@ -44,7 +44,7 @@ def test_float32_positions_do_not_lose_digits_of_the_truth() -> None:
         (np.ones(3), np.ones(3), np.full((3, 2), np.inf), "truth: expected finite numbers"),
     ],
 )
-def test_bad_positions(x: Any, y: Any, truth: Any, words: str) -> None:
+def test_positions_of_wrong_shape_are_refused(x: Any, y: Any, truth: Any, words: str) -> None:
     with refused(words):
         slope_error(x, y, truth)
 
@@ -117,7 +117,7 @@ def test_outliers_are_beyond_the_limit_on_either_axis() -> None:
     assert np.isnan(slope_statistics(x, y, truth).gain.value)  # the truth does not vary
 
 
-def test_perfect_slopes() -> None:
+def test_perfect_slopes_have_gain_one_and_no_error() -> None:
     truth = np.random.default_rng(4).uniform(-1, 1, (2, 5, 2))
     statistics = slope_statistics(truth[..., 0], truth[..., 1], truth)
     assert statistics.gain.value == pytest.approx(1.0)
@@ -129,7 +129,7 @@ def test_perfect_slopes() -> None:
     ("options", "words"),
     [({"valid": [True]}, "valid: expected shape (3,)"), ({"outlier_px": 0}, "outlier_px = 0")],
 )
-def test_bad_statistics(options: dict[str, Any], words: str) -> None:
+def test_statistics_refuse_wrong_options(options: dict[str, Any], words: str) -> None:
     with refused(words):
         slope_statistics(np.ones(3), np.ones(3), np.ones((3, 2)), **options)
     with pytest.raises(InputError, match="at least one value"):

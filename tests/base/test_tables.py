@@ -12,7 +12,7 @@ from faintspot.base.errors import InputError
 from faintspot.base.tables import parse_changes, parse_ranges
 
 
-def test_parsing_changes() -> None:
+def test_changes_are_parsed_to_their_types() -> None:
     texts = ["noise_std=2.5", " keep_brightest = 20", "denoise=TRUE", "flux_e=none", "rule=threshold"]
     assert parse_changes([*texts, "tolerance=1e-3,0.1", "steps=3"]) == {
         "noise_std": 2.5,
@@ -33,7 +33,7 @@ def test_changes_that_cannot_be_parsed(texts: list[str]) -> None:
         parse_changes(texts)
 
 
-def test_parsing_subapertures() -> None:
+def test_ranges_of_subapertures_are_parsed() -> None:
     assert parse_ranges("4,5,10-13") == [4, 5, 10, 11, 12, 13]
     assert parse_ranges(" 7 , 3-3, 2-4 ") == [7, 3, 2, 4]
 

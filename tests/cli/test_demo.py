@@ -19,7 +19,9 @@ FILES = {"frames.npy", "truth.npy", "tv.toml", "tv.npz", "no-tv.toml", "no-tv.np
 
 
 @pytest.mark.slow
-def test_demo_twice(folder: Path, run: Commands, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_demo_writes_all_files_and_repeats_exactly(
+    folder: Path, run: Commands, monkeypatch: pytest.MonkeyPatch
+) -> None:
     first = run.ok("demo", "--frames", 40, "-o", "new/demo", "--seed", 7)
     made = folder / "new" / "demo"
     assert {path.name for path in made.iterdir()} == FILES
@@ -43,7 +45,7 @@ def test_demo_twice(folder: Path, run: Commands, monkeypatch: pytest.MonkeyPatch
     assert (made / "report.html").read_text(encoding="utf-8") == "second"
 
 
-def test_bad_options(folder: Path, run: Commands) -> None:
+def test_demo_refuses_wrong_options(folder: Path, run: Commands) -> None:
     run.refused("demo", "--frames", 5, naming=("--frames", "5"))
     run.refused("demo", "--seed", -1, naming=("--seed", "-1"))
     run.refused("demo", "-o", "faintspot.toml", naming=("faintspot.toml", "folder"))

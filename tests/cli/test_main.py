@@ -101,7 +101,7 @@ def test_help_is_in_sections_with_defaults(run: Commands) -> None:
     assert "INTEGER" not in text + run.ok("realtime", "run", "--help").out
 
 
-def test_module_runs() -> None:
+def test_module_runs_as_a_command() -> None:
     process = command_line("--version")
     out, err = process.communicate(timeout=60)
     assert (process.returncode, err) == (0, "")

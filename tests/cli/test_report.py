@@ -43,7 +43,7 @@ def test_frames_that_have_moved(measured: Path, run: Commands) -> None:
     run.refused("report", "slopes.zarr", "--recording", "nix.npy", naming=("nix.npy",))
 
 
-def test_bad_stores(measured: Path, run: Commands) -> None:
+def test_stores_that_hold_no_slopes_are_refused(measured: Path, run: Commands) -> None:
     run.refused("report", "nix.zarr", naming=("nix.zarr", "no such file"))
     run.refused("report", "a.npy", naming=("a.npy",))
     run.refused("report", ".", naming=(".: ", "Zarr store of slopes"))
@@ -57,7 +57,7 @@ def test_bad_stores(measured: Path, run: Commands) -> None:
     assert not list(measured.glob("*.html"))
 
 
-def test_bad_output(measured: Path, run: Commands) -> None:
+def test_pages_in_place_of_other_files_are_refused(measured: Path, run: Commands) -> None:
     run.refused("report", "slopes.zarr", "-o", "nix/page.html", naming=("nix/page.html", "does not exist"))
     before = (measured / "plain.npz").read_bytes()
     run.refused("report", "plain.npz", "-o", "plain.npz", naming=("plain.npz", "page"))

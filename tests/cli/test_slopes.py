@@ -18,7 +18,7 @@ zarr = pytest.importorskip("zarr")
 
 
 @pytest.mark.slow
-def test_frames_in(folder: Path, run: Commands) -> None:
+def test_compressed_fits_frames_become_slopes(folder: Path, run: Commands) -> None:
     frames = simulated()
     fits.PrimaryHDU(frames).writeto(folder / "a.fits.gz")
     result = run.ok("slopes", "a.fits.gz")
@@ -29,7 +29,7 @@ def test_frames_in(folder: Path, run: Commands) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["s.zarr", "s.fits", "s.fits.gz", "s.npz", "s.csv", "with space.npz"])
-def test_formats_out(folder: Path, run: Commands, name: str) -> None:
+def test_slopes_are_written_in_every_format(folder: Path, run: Commands, name: str) -> None:
     frames = simulated()
     np.save("a.npy", frames)
     result = run.ok("slopes", "a.npy", "-o", name)
@@ -41,7 +41,7 @@ def test_formats_out(folder: Path, run: Commands, name: str) -> None:
 
 
 @pytest.mark.slow
-def test_key(folder: Path, run: Commands) -> None:
+def test_key_chooses_an_array_of_a_file(folder: Path, run: Commands) -> None:
     frames = simulated()
     np.savez("a.npz", night=frames, dark=frames[:3])
     run.refused("slopes", "a.npz", naming=("a.npz", "night, dark", "a.npz:NAME"))
@@ -74,7 +74,7 @@ def test_preset_goes_before_the_configuration(folder: Path, run: Commands) -> No
 
 
 @pytest.mark.slow
-def test_reference(folder: Path, run: Commands) -> None:
+def test_reference_is_subtracted_and_stored(folder: Path, run: Commands) -> None:
     frames = simulated()
     reference = np.random.default_rng(4).normal(0, 0.3, (16, 2))
     np.save("a.npy", frames)
@@ -214,7 +214,7 @@ BAD_FRAMES: list[tuple[str, Callable[[Path], Any], tuple[str, ...]]] = [
 
 @pytest.mark.parametrize(("name", "make", "naming"), BAD_FRAMES, ids=[case[0] for case in BAD_FRAMES])
 @pytest.mark.parametrize("output", ["s.zarr", "s.npz"])
-def test_bad_frames(
+def test_damaged_frames_are_refused(
     folder: Path, run: Commands, name: str, make: Any, naming: tuple[str, ...], output: str
 ) -> None:
     make(folder / name)
@@ -234,19 +234,21 @@ def test_bad_frames(
         (CONFIGURATION + '[calibration]\ndark = "dark.fits"', ("calibration.dark", "no such file")),
     ],
 )
-def test_bad_configuration(folder: Path, run: Commands, text: str, naming: tuple[str, ...]) -> None:
+def test_damaged_configuration_is_refused(
+    folder: Path, run: Commands, text: str, naming: tuple[str, ...]
+) -> None:
     np.save("a.npy", simulated())
     (folder / "faintspot.toml").write_text(text)
     run.refused("slopes", "a.npy", naming=("faintspot.toml", *naming))
     assert not (folder / "slopes.zarr").exists()
 
 
-def test_no_configuration(folder: Path, run: Commands) -> None:
+def test_absent_configuration_names_the_layout_command(folder: Path, run: Commands) -> None:
     np.save("a.npy", simulated())
     run.refused("slopes", "a.npy", "-c", "nix.toml", naming=("nix.toml", "no such file", "faintspot layout"))
 
 
-def test_bad_output(folder: Path, run: Commands) -> None:
+def test_output_that_cannot_be_written_is_refused(folder: Path, run: Commands) -> None:
     np.save("a.npy", simulated())
     run.refused("slopes", "a.npy", "-o", "s.xyz", naming=("s.xyz", ".zarr", ".csv"))
     run.refused("slopes", "a.npy", "-o", "nix/s.npz", naming=("nix/s.npz", "folder nix does not exist"))
@@ -281,7 +283,7 @@ def test_foreign_directory_is_never_replaced(folder: Path, run: Commands) -> Non
 
 
 @pytest.mark.parametrize("reference", [np.ones((16, 3)), np.full((16, 2), np.nan)])
-def test_bad_reference(folder: Path, run: Commands, reference: Any) -> None:
+def test_references_that_do_not_fit_are_refused(folder: Path, run: Commands, reference: Any) -> None:
     np.save("a.npy", simulated())
     np.save("r.npy", reference)
     run.refused("slopes", "a.npy", "--reference", "r.npy", naming=("r.npy", "reference"))

@@ -83,7 +83,9 @@ def test_a_killed_run_goes_on_where_it_ended(
     assert_equal(output, uninterrupted)
 
 
-def test_ctrl_c(prepared: Callable[[str], Path], run: Commands, uninterrupted: Slopes) -> None:
+def test_interrupted_run_is_resumed(
+    prepared: Callable[[str], Path], run: Commands, uninterrupted: Slopes
+) -> None:
     output = prepared("s.zarr")
     code, errors = start_and_stop(output, signal.SIGINT)
     assert code == 130

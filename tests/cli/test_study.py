@@ -44,7 +44,9 @@ flux_e = { from = 10, to = 1000, points = 12, spacing = "log" }
 """
 
 
-def test_estimators(folder: Path, run: Commands, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_estimators_study_writes_its_page(
+    folder: Path, run: Commands, monkeypatch: pytest.MonkeyPatch
+) -> None:
     sweep = Sweep("a", flux_e=[50, 200], pixels=8)
     small = StudySpecification(
         "estimators", [sweep], realisations=100, estimators=["brightest", "ml"], fixed_k=[]
@@ -55,7 +57,7 @@ def test_estimators(folder: Path, run: Commands, monkeypatch: pytest.MonkeyPatch
     assert "What was found" in Path("estimators-quick.html").read_text(encoding="utf-8")
 
 
-def test_run(folder: Path, run: Commands) -> None:
+def test_study_is_stored_resumed_and_replaced(folder: Path, run: Commands) -> None:
     Path("my-study.toml").write_text(SMALL)
     first = run.ok("study", "my-study.toml", "--workers", 0)
     assert "2 of them in this run" in first.out
@@ -71,7 +73,7 @@ def test_run(folder: Path, run: Commands) -> None:
     assert open_study("my-study.zarr").attrs["n"] == 300
 
 
-def test_bad_input(folder: Path, run: Commands) -> None:
+def test_studies_that_make_no_sense_are_refused(folder: Path, run: Commands) -> None:
     run.refused("study", "nothing.toml", naming=("nothing.toml", "no such file"))
     Path("bad.toml").write_text(SMALL + "read_noise_e = -1\n")
     run.refused("study", "bad.toml", naming=("bad.toml", "read_noise_e = -1"))

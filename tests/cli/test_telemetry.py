@@ -43,7 +43,7 @@ def noisy(frame: int) -> Slopes:
 
 
 @pytest.mark.slow
-def test_running_engine(folder: Path, run: Commands, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_running_engine_is_reported(folder: Path, run: Commands, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(telemetry_cases, "slopes_of", noisy)
     name = f"faintspot-test-{secrets.token_hex(6)}"
     with Engine(TelemetryRing.create(name, LAYOUT, settings=SETTINGS)):

@@ -68,7 +68,9 @@ def test_calibration_of_an_existing_configuration_counts_and_stays(run: Commands
     )
 
 
-def test_binned_layout(run: Commands, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_binned_layout_is_tuned_in_binned_pixels(
+    run: Commands, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(tmp_path)
     layout = Layout.grid((4, 4), pixels=16, bin=2, frame_shape=(65, 65))
     layout.save("layout.toml")
@@ -119,7 +121,7 @@ def test_what_is_found_of_binned_frames_is_written_in_camera_pixels(tmp_path: Pa
 
 
 @pytest.mark.slow
-def test_from_frames(run: Commands) -> None:
+def test_tune_learns_psf_from_frames(run: Commands) -> None:
     np.save("frames.npy", simulated())
     LAYOUT.save("layout.toml")
     arguments = ("--recording", "frames.npy", "--config", "layout.toml", "--gain-e-per-adu", 1)

@@ -84,7 +84,9 @@ def captured(name: str, count: int) -> dict[int, tuple[np.ndarray, np.ndarray]]:
     return found
 
 
-def test_three_processes(name: str, processes: list[subprocess.Popen[bytes]], tmp_path: Path) -> None:
+def test_camera_engine_and_client_work_as_processes(
+    name: str, processes: list[subprocess.Popen[bytes]], tmp_path: Path
+) -> None:
     wait_for(lambda: socket_path(name).exists(), "the engine")
     wait_for(lambda: json.loads(ask(name, "status", "--json"))["counters"]["processed"] > 10, "frames")
     pipeline = fs.SlopePipeline.from_file(tmp_path / "faintspot.toml")

@@ -63,7 +63,7 @@ def test_telemetry_says_with_which_calibration_and_spot(bench: Bench) -> None:
     assert unpacked(bench.telemetry.description["parts"]) == (CALIBRATION, None, None)
 
 
-def test_source_restarts(bench: Bench) -> None:
+def test_restarted_source_loses_no_frame(bench: Bench) -> None:
     data = simulated(2)
     expected = make(SETTINGS)(data).vector
     for start in (0, 100):

@@ -190,7 +190,9 @@ def test_what_is_refused_changes_nothing(camera: Camera, tmp_path: Path) -> None
 
 
 @pytest.mark.usefixtures("tried_here")
-def test_the_commands(camera: Camera, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_commands_load_replace_and_unload_estimators(
+    camera: Camera, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def run(*arguments: str) -> str:
         result = CliRunner().invoke(command, [*arguments, "--name", camera.name], catch_exceptions=False)
         assert result.exit_code == 0
@@ -231,7 +233,7 @@ def trial(path: Path, limit_s: float = 60.0) -> EstimatorTrial:
     return EstimatorTrial(path, make, SETTINGS.replace(where=[0, 3], search_range_px=2.0), limit_s)
 
 
-def test_what_passes(tmp_path: Path) -> None:
+def test_trial_runs_in_another_process(tmp_path: Path) -> None:
     """It runs in another process, which may print what it likes."""
     path = write(tmp_path, f"print('{{')\nos.environ['FS_TRIAL'] = 'x'\n{PEAK}")
     digest = hashlib.sha256(path.read_bytes()).hexdigest()

@@ -48,7 +48,9 @@ def test_a_short_frame(bench: Bench) -> None:
         ([5, 2**63 - 1, 0, 1], 0, 1),
     ],
 )
-def test_frame_numbers(bench: Bench, numbers: list[int], skipped: int, repeated: int) -> None:
+def test_repeated_and_skipped_numbers_are_counted(
+    bench: Bench, numbers: list[int], skipped: int, repeated: int
+) -> None:
     """No frame that came is lost where numbers stay, are left out, begin anew or jump."""
     data = simulated(len(numbers))
     bench.measure(data, numbers)

@@ -216,7 +216,7 @@ def test_groups_wait_for_their_last_row_only() -> None:
         (np.zeros((2, *LAYOUT.frame_shape), np.int32), "uint16 or float32"),
     ],
 )
-def test_wrong_slots(slots: NDArray[Any], message: str) -> None:
+def test_rings_of_another_size_are_refused(slots: NDArray[Any], message: str) -> None:
     with pytest.raises(fs.InputError, match=message):
         FramePath(pipeline("plain"), slots, Progress(np.zeros(2, np.int64), 0, 1))
 

@@ -99,7 +99,7 @@ def assert_nothing(left: dict[str, int], count: int, bytes_each: int) -> None:
     assert left["imported"] <= 3, left
 
 
-def test_frames_alone(changing: Changing) -> None:
+def test_frames_alone_leave_no_memory_behind(changing: Changing) -> None:
     """Two thousand frames take less than 1 MB."""
     assert_nothing(changing.left_behind(lambda number: None, 2000), 0, 0)
 

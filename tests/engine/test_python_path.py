@@ -158,7 +158,7 @@ def test_one_that_is_too_slow() -> None:
     assert source.path.fault is not None
 
 
-def test_a_trial() -> None:
+def test_trial_refuses_failing_and_slow_estimators() -> None:
     def settings(action: Any) -> fs.Settings:
         return SETTINGS.replace(estimator=Odd(action=action))
 

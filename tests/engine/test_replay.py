@@ -184,7 +184,7 @@ def test_stop_while_the_disk_is_slow(name: str, tmp_path: Path, monkeypatch: pyt
             released.set()
 
 
-def test_bad_options(name: str, tmp_path: Path) -> None:
+def test_replay_refuses_wrong_options(name: str, tmp_path: Path) -> None:
     with open_frames([stored(tmp_path, cube(4))]) as source, PixelRing.create(name, SHAPE, np.uint16) as ring:
         good = partial(Replay, source, ring, frame_rate_hz=100.0)
         assert_each_refused(good, first=[-1, 4], n_frames=[0, 5], frame_rate_hz=[0.0], rows_per_block=[7])
@@ -231,7 +231,7 @@ def test_command_replays_the_frames_asked_for(name: str, tmp_path: Path) -> None
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
-def test_command_waits(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_replay_waits_for_a_slow_engine(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     frames, engine = cube(10), SlowEngine(name)
     monkeypatch.setattr(replay_module, "_nap", engine.measure)
     result = CliRunner().invoke(replay, [str(stored(tmp_path, frames)), "--name", name])

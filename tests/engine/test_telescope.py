@@ -130,7 +130,7 @@ def test_frames_and_truth_are_the_simulated_loops(
     assert np.ptp(record.strehl) > 0.05  # commands do something
 
 
-def test_realisations_differ(name: str) -> None:
+def test_each_realisation_has_its_turbulence(name: str) -> None:
     with Watched(name, realisation=1, seed=5) as watched:
         telescope_model = TelescopeModel(CONFIGURATION, 5, 1)
         seen = telescope_model.wavefronts(0.5e-3, np.zeros(COMMANDS))[1]
@@ -266,7 +266,7 @@ def test_magnitude_and_seeing_are_converted() -> None:
     assert now.r0_m == pytest.approx((0.1007, 0.2013), rel=1e-3)  # 0.976 x 500 nm / 1 arcsec
 
 
-def test_bad_orders() -> None:
+def test_conditions_out_of_range_are_refused() -> None:
     def ordered(**changes: Any) -> None:
         ObservingConditions.of(CONFIGURATION).ordered(CONFIGURATION, {"wind_factor": 3.0, **changes})
 

@@ -132,7 +132,7 @@ def test_gain_beyond_the_curve_has_a_sign(flux: float, expected: float) -> None:
     assert math.isnan(magnitude_gain(with_scatter(flux), 5.0, np.random.default_rng(3), **options).value)
 
 
-def test_limiting_flux() -> None:
+def test_limiting_flux_has_its_error() -> None:
     limit = limiting_flux(with_scatter(5.0), "reference", 0.5, np.random.default_rng(3))
     assert limit.value == pytest.approx(40.0, rel=0.01)
     # 10 % of scatter over 2000 spots is 0.22 % of R, 0.45 % of the flux, less between two points.

@@ -57,7 +57,7 @@ def test_cost_is_bounded() -> None:
     assert {cell.read_noise_e for cell in full} >= {0.1, 1, 3, 16}
 
 
-def test_figures() -> None:
+def test_estimator_figures_have_their_panels() -> None:
     made = {figure.name: figure for figure in estimator_figures(study())}
     assert set(made) == {
         "estimators-diffraction",
@@ -83,7 +83,7 @@ def test_unfinished_studies_are_drawn_as_far_as_they_are() -> None:
     assert names == ["estimators-diffraction"]
 
 
-def test_enough_photons() -> None:
+def test_faint_cells_have_too_few_photons() -> None:
     given = [
         (0.1, 30, True),
         (0.1, 29, False),
@@ -111,7 +111,7 @@ def test_other_studies_do_not_compare_estimators() -> None:
     assert not compares_estimators(dataset(cells(), error))
 
 
-def test_report(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_estimators_report_has_its_figures(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(plots, "DOTS_PER_INCH", 20)
     monkeypatch.setattr(plots, "svg", lambda figure: b"")  # another drawing, as slow
     specification = estimators_study(quick=True)

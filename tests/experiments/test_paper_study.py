@@ -36,7 +36,7 @@ def test_figure_five_needs_cells_of_its_own_for_faint_spots_at_much_noise_only(q
 
 @pytest.mark.parametrize("name", FIGURES)
 @pytest.mark.parametrize("quick", [False, True])
-def test_one_figure(name: str, quick: bool) -> None:
+def test_one_figure_has_its_own_sweeps(name: str, quick: bool) -> None:
     sweeps = paper_study(quick, [name]).sweeps
     assert sweeps
     assert all(sweep.name.startswith(name) for sweep in sweeps)

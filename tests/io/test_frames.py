@@ -70,7 +70,7 @@ class TestSequence:
         ("cut.npy:frames", "one unnamed"),
     ],
 )
-def test_refused_paths(tmp_path: Path, name: str, part: str) -> None:
+def test_paths_that_hold_no_frames_are_refused(tmp_path: Path, name: str, part: str) -> None:
     (tmp_path / "empty.fits").touch()
     (tmp_path / "text.log").write_text("some text")
     (tmp_path / "folder").mkdir()
@@ -124,7 +124,7 @@ class TestReadArray:
         np.testing.assert_array_equal(read_array(f"{tmp_path / 'a.npz'}:line"), np.arange(5.0))
 
     @pytest.mark.parametrize("array", [np.zeros((2, 2), complex), np.zeros((0, 3)), np.float64(1)])
-    def test_refused(self, tmp_path: Path, array: NDArray[Any]) -> None:
+    def test_arrays_that_are_no_numbers_are_refused(self, tmp_path: Path, array: NDArray[Any]) -> None:
         np.save(tmp_path / "a.npy", array)
         with refused("a.npy", "expected"):
             read_array(tmp_path / "a.npy")

@@ -192,7 +192,7 @@ def test_folder_of_texts(tmp_path: Path) -> None:
     np.testing.assert_array_equal(values["slopes"], LOOP.commands)
 
 
-def test_one_array(tmp_path: Path) -> None:
+def test_single_array_is_slopes(tmp_path: Path) -> None:
     fits.writeto(tmp_path / "slopes.fits", LOOP.slopes)
     values = read_layout(tmp_path / "slopes.fits", {})
     np.testing.assert_array_equal(values["slopes"], LOOP.slopes)

@@ -53,7 +53,7 @@ def test_lost_frames_and_jitter(tmp_path: Path) -> None:
     np.testing.assert_array_equal(values["commands"], LOOP.commands[kept])
 
 
-def test_one_cube(tmp_path: Path) -> None:
+def test_single_cube_is_read_with_its_folder(tmp_path: Path) -> None:
     loop_layouts.milk(tmp_path, LOOP, 1)
     (cube,) = (tmp_path / "wfs").glob("*.fits")
     np.save(tmp_path / "im.npy", LOOP.matrix)
@@ -135,12 +135,12 @@ def test_no_frames_in_common(tmp_path: Path) -> None:
         ({"name": "wfs"}, "expected the stream signal, found wfs"),
     ],
 )
-def test_damaged_sessions(tmp_path: Path, change: dict[str, Any], message: str) -> None:
+def test_damaged_sessions_are_refused(tmp_path: Path, change: dict[str, Any], message: str) -> None:
     with pytest.raises(InputError, match=message):
         read_session(session(tmp_path, **change))
 
 
-def test_damaged_manifest(tmp_path: Path) -> None:
+def test_damaged_manifest_is_refused(tmp_path: Path) -> None:
     (tmp_path / "session.json").write_text("[]")
     with pytest.raises(InputError, match=r"damaged session\.json"):
         read_session(tmp_path)

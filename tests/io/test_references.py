@@ -46,7 +46,7 @@ def test_where_nothing_is_valid(tmp_path: Path) -> None:
         read_reference(tmp_path / "b.npz")
 
 
-def test_unfinished_store(tmp_path: Path) -> None:
+def test_unfinished_store_gives_the_mean_so_far(tmp_path: Path) -> None:
     begin(tmp_path / "a.zarr", 20)
     slopes = part(result(), 0, 20)
     mean = slopes["x"][slopes["valid"][:, 0], 0].mean(dtype=np.float64)

@@ -80,7 +80,7 @@ def test_dark_of_many_frames_is_read_in_parts(tmp_path: Path) -> None:
     assert np.array_equal(Calibration.load(tmp_path / "a.toml").dark, np.full((256, 256), 7.0))
 
 
-def test_large_chunks(tmp_path: Path) -> None:
+def test_chunks_that_are_too_large_are_refused(tmp_path: Path) -> None:
     shape = (1 << 40, 64, 64)
     zarr.create_array(str(tmp_path / "a.zarr"), shape=shape, dtype="f4", chunks=shape)
     with h5py.File(tmp_path / "a.h5", "w") as file:
@@ -177,7 +177,7 @@ def test_tiff_strips_and_tiles(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("is_damaged", [False, True])
 @pytest.mark.parametrize("is_aot", [False, True])
-def test_fits_tiles(tmp_path: Path, is_damaged: bool, is_aot: bool) -> None:
+def test_fits_tiles_that_inflate_too_far_are_refused(tmp_path: Path, is_damaged: bool, is_aot: bool) -> None:
     """A tile of 64 MiB, which inflates to more than the image of 64 x 64 px where the header is changed."""
     image = fits.CompImageHDU(
         np.zeros((8192, 8192), np.uint8), compression_type="GZIP_1", tile_shape=(8192, 8192)
@@ -197,7 +197,7 @@ def test_fits_tiles(tmp_path: Path, is_damaged: bool, is_aot: bool) -> None:
     assert unit.value_bytes == (64 * 64 if is_damaged else 64 * MIB)
 
 
-def test_tiny_chunks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_frames_of_too_many_chunks_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     frames = np.arange(6 * 8 * 8, dtype=np.uint16).reshape(6, 8, 8)
     with h5py.File(tmp_path / "a.h5", "w") as file:
         file.create_dataset("frames", data=frames, chunks=(1, 2, 2))

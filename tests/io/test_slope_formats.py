@@ -153,7 +153,9 @@ def test_damaged_chunk_of_a_store(
         ("a.npz", ("n_frames",), {"n_frames": 0}),
     ],
 )
-def test_refused_descriptions(tmp_path: Path, name: str, parts: tuple[str, ...], changes: Any) -> None:
+def test_descriptions_that_do_not_fit_are_refused(
+    tmp_path: Path, name: str, parts: tuple[str, ...], changes: Any
+) -> None:
     assert_refused(tmp_path / name, *parts, **changes)
     assert not list(tmp_path.iterdir())
 

@@ -122,7 +122,7 @@ def modal(modes: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize("matrix", [ZONAL, -1e5 * ZONAL, modal(9), modal(2)])
-def test_right_orders(matrix: np.ndarray) -> None:
+def test_right_orders_get_no_remark(matrix: np.ndarray) -> None:
     assert order_remark(matrix, CELLS) == ""
 
 
@@ -140,7 +140,7 @@ def test_known_orders_are_named(rows: np.ndarray, cells: np.ndarray, message: st
         order_remark(ZONAL[rows], cells)
 
 
-def test_shuffled_cells() -> None:
+def test_shuffled_cells_are_refused() -> None:
     shuffled = np.random.default_rng(1).permutation(CELLS)
     with pytest.raises(InputError, match="check that row and column of each"):
         order_remark(ZONAL, shuffled)

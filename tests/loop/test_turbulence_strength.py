@@ -41,7 +41,7 @@ def found(slopes: np.ndarray, **options: float) -> TurbulenceStrength:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("noise_px", [0.0, 0.5])
-def test_known_turbulence(slopes: np.ndarray, noise_px: float) -> None:
+def test_known_turbulence_is_found_within_its_errors(slopes: np.ndarray, noise_px: float) -> None:
     """Within three errors; the noise has as much variance as the turbulence of a slope."""
     noise = noise_px * np.random.default_rng(4).standard_normal(slopes.shape)
     strength = found(slopes + noise)
@@ -52,13 +52,13 @@ def test_known_turbulence(slopes: np.ndarray, noise_px: float) -> None:
     assert known.r0_error_m < strength.r0_error_m
 
 
-def test_stronger_slopes(slopes: np.ndarray) -> None:
+def test_twice_the_slopes_have_a_smaller_r0(slopes: np.ndarray) -> None:
     """Twice the slopes: r0 is smaller by 2^(6/5)."""
     ratio = found(2 * slopes).r0_m / found(slopes).r0_m
     assert ratio == pytest.approx(2**-1.2, rel=1e-6)
 
 
-def test_gain_error(slopes: np.ndarray) -> None:
+def test_uncertain_gain_adds_to_the_error_of_r0(slopes: np.ndarray) -> None:
     """An uncertain gain of residual slopes adds to the error."""
     run = np.repeat(np.arange(4), FRAMES // 4)
     sure, unsure = (

@@ -171,7 +171,7 @@ def loop() -> type:
             super().__init__(conf)
 
         def predictive_filter(self) -> None:
-            """Send the command for the next signal; the first time from the mirror as it is."""
+            """Send the command for the next signal, the first time from the present mirror command."""
             if self.controller is None:
                 raise InputError("loop.controller: expected the file of a predictive controller, got none")
             slopes = self._read_signal()

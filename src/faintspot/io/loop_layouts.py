@@ -23,7 +23,7 @@ _KECK_TICK_S = 1e-7
 
 @dataclass(frozen=True, kw_only=True)
 class TelemetryLayout:
-    """Where a kind of files has the quantities of a loop.
+    """Names of the quantities of a loop in one kind of files.
 
     Names are those of columns, fields or files; capitals do not count. They may be patterns with *, and
     alternatives with |.

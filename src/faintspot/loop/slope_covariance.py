@@ -231,7 +231,7 @@ _MOST_SUBAPERTURES, _FEWEST_SUBAPERTURES = 60, 9
 _FEWEST_MODES = 5  # without tip and tilt: fewer need not be those with the most turbulence
 _OF_NOISE = 3.0  # times the noise's, for modes of turbulence
 _OF_TURBULENCE = 0.5, 0.25
-"""As `_FITS` and `_WRONG`, of the modes of 500 frames of turbulence: right orders .57 to .79, shuffled ones
+"""Like `_FITS` and `_WRONG`, of modes of 500 frames of turbulence: right orders .57 to .79, shuffled ones
 up to .05, with axes exchanged .09 to .4, with rows upwards .25 to .38."""
 _LEAST = 1e-3  # of the largest singular value, that counts as a mode of the mirror
 _OUTER_SCALE = 40.0  # sub-apertures

@@ -39,7 +39,7 @@ def measured(run: Commands, frames: NDArray[np.float64], *options: str | float) 
 
 
 @pytest.mark.usefixtures("only_found")
-def test_colour_mosaic(folder: Path, run: Commands) -> None:
+def test_binned_colour_mosaic_is_measured(folder: Path, run: Commands) -> None:
     frames = frames_of(220, 9, 20.3, 1.5, 5000.0, 2.0)
     rows, columns = np.indices(frames.shape[1:]) % 2
     frames *= np.where(rows != columns, 0.25, np.where(rows == 0, 1.0, 0.05))
@@ -69,7 +69,7 @@ def test_windows_over_64_px(folder: Path, run: Commands) -> None:
 
 
 @pytest.mark.usefixtures("only_found")
-def test_known_grid(folder: Path, run: Commands) -> None:
+def test_stated_grid_is_binned(folder: Path, run: Commands) -> None:
     frames = frames_of(240, 3, 80.0, 4.0, 20_000.0, 3.0)
     rise, _, valid = measured(run, frames, "--bin", 2, "--grid", "3x3", "--pupil", "119.5,119.5,200")
     assert rise == pytest.approx(3.0, abs=0.05)

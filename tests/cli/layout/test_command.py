@@ -54,7 +54,7 @@ def is_png(path: Path) -> bool:
 
 
 @pytest.mark.parametrize("geometry", ["square", "hexagonal"])
-def test_simulated_frames(folder: Path, run: Commands, geometry: str) -> None:
+def test_simulated_frames_give_their_lattice(folder: Path, run: Commands, geometry: str) -> None:
     """Lattice points within 0.2 px: 3 frames of 49 spots leave 0.01 px, the fit of a common grid less."""
     np.save("a.npy", frames(geometry))
     result = run.ok("layout", "a.npy", "-o", "new.toml", "--dark", "100", "--pixels", 16)
@@ -93,7 +93,7 @@ def test_slopes_do_not_depend_on_the_unit_of_the_frames(folder: Path, run: Comma
 
 
 @pytest.mark.usefixtures("only_found")
-def test_dark_file(folder: Path, run: Commands) -> None:
+def test_dark_file_is_read_and_kept(folder: Path, run: Commands) -> None:
     dark = np.random.default_rng(2).uniform(50, 150, SHAPE)
     np.save("a.npy", frames().astype(np.float32) - OFFSET_ADU + dark)
     np.savez("d.npz", dark=dark, other=np.ones((3, 3)))
@@ -209,7 +209,7 @@ def test_scales_on_the_sky_and_in_the_pupil(folder: Path, run: Commands) -> None
 
 @DOUBTS
 @pytest.mark.usefixtures("only_found")
-def test_which_lenslets(folder: Path, run: Commands) -> None:
+def test_pixels_exclude_pupil_and_roi_choose_lenslets(folder: Path, run: Commands) -> None:
     np.save("a.npy", frames())
     arguments = ("layout", "a.npy", "--overwrite", "-o", "new.toml")
     run.ok(*arguments, "--pixels", "12,16")
@@ -252,7 +252,7 @@ def test_numbers_are_plain_and_doubt_is_said(folder: Path, run: Commands) -> Non
     assert "  doubtful: " in run.ok("layout", "b.npy", "-o", "b.toml").out
 
 
-def test_pure_noise(folder: Path, run: Commands) -> None:
+def test_pure_noise_is_refused(folder: Path, run: Commands) -> None:
     np.save("a.npy", np.random.default_rng(3).normal(100, 5, (3, 128, 128)))
     run.refused("layout", "a.npy", "-o", "new.toml", naming=("a.npy", "state the pitch"))
     np.save("b.npy", np.full((3, 128, 128), np.nan))
@@ -291,7 +291,7 @@ def test_places_that_cannot_be_written(folder: Path, run: Commands) -> None:
         ("data/test_newf9.fits.gz", "hexagonal", None, 141, 149),
     ],
 )
-def test_real_frames(
+def test_real_frames_give_their_lenslets(
     folder: Path, run: Commands, name: str, geometry: str, shape: Any, lowest: int, highest: int
 ) -> None:
     result = run.ok("layout", shared_file(name), "-o", "real.toml")

@@ -27,7 +27,7 @@ def save_frames(layout: Layout = QUAD) -> None:
     np.save("a.npy", frames)
 
 
-def test_quad_cells(folder: Path, run: Commands) -> None:
+def test_quad_cells_are_measured_by_their_halves(folder: Path, run: Commands) -> None:
     save_frames()
     out = run.ok("layout", "a.npy", "--grid", "8x8", "-o", "new.toml").out
     assert Layout.load("new.toml").corners.tolist() == QUAD.corners.tolist()

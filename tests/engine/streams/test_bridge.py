@@ -74,7 +74,7 @@ def created(name: str, dtype: Any = np.uint16, shape: tuple[int, int] = SHAPE, *
 
 @pytest.mark.parametrize("notify", [False, True])
 @pytest.mark.parametrize("dtype", ["uint16", "int32", "float64"])
-def test_frames_arrive(name: str, running: Running, dtype: str, notify: bool) -> None:
+def test_frames_of_a_stream_arrive_in_the_ring(name: str, running: Running, dtype: str, notify: bool) -> None:
     running.said("is not there; waiting")
     stream = created(name, dtype, notify=notify)
     running.said("6 x 5 pixels")

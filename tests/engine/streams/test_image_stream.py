@@ -340,7 +340,7 @@ def test_command_both_ways(folder: Path, name: str) -> None:
         (["isio:a/b"], "isio:a/b"),
     ],
 )
-def test_command_refuses(arguments: list[str], naming: str) -> None:
+def test_bridge_refuses_wrong_arguments(arguments: list[str], naming: str) -> None:
     from faintspot.cli.realtime.sources import bridge
 
     with pytest.raises(InputError, match=naming):

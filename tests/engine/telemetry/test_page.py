@@ -118,7 +118,7 @@ def test_latencies_of_a_short_record_are_drawn(path: Path, n_frames: int) -> Non
     assert all(line.get_marker() == "o" for line in axes.lines)
 
 
-def test_without_frames(tmp_path: Path) -> None:
+def test_telemetry_without_frames_is_refused(tmp_path: Path) -> None:
     kinds = record_type(N), image_type(LAYOUT.frame_shape, N, LAYOUT.window)
     TelemetryStore(tmp_path / "empty.zarr", *kinds, {"layout": layout_values(LAYOUT)})
     with pytest.raises(InputError, match="no frame is recorded yet"):

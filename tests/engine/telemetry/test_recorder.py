@@ -67,7 +67,9 @@ def test_a_number_of_frames(engine: Engine, name: str, tmp_path: Path) -> None:
 
 
 @with_threads
-def test_a_time(engine: Engine, name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_recorder_ends_after_its_time(
+    engine: Engine, name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Written in many parts."""
     monkeypatch.setattr(recorder, "_FLUSH_S", 0.02)
     report = Recorder(name, tmp_path / "night.zarr").run(seconds=0.5)
@@ -89,7 +91,9 @@ def test_an_engine_that_ends(engine: Engine, name: str, tmp_path: Path) -> None:
 
 
 @with_threads
-def test_a_signal(engine: Engine, name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_recorder_ends_by_a_signal(
+    engine: Engine, name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(recorder, "_FLUSH_S", 0.02)
     stop = threading.Event()
     report = Recorder(name, tmp_path / "night.zarr").run(

@@ -79,7 +79,7 @@ def test_methods_can_be_added(tmp_path: Path, whole: Path) -> None:
     np.testing.assert_array_equal(three.strehl[:2], both.strehl)
 
 
-def test_bad_input(tmp_path: Path) -> None:
+def test_magnitude_without_methods_or_photons_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="methods: expected at least one"):
         run_magnitude(small(), tmp_path, (), PHOTONS, pool=HERE)
     with pytest.raises(InputError, match="photons: expected at least one"):

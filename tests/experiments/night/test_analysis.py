@@ -200,7 +200,7 @@ def test_a_shared_error_widens_intervals_and_does_not_fall_with_time() -> None:
     assert too_much.shared_error == pytest.approx(0.03)
 
 
-def test_hours() -> None:
+def test_hours_needed_grow_with_the_shared_error() -> None:
     assert hours_needed(0.03, 0.02, 1.0) == pytest.approx(4.0)
     assert hours_needed(0.03, math.hypot(0.02, 0.006), 1.0, shared_error=0.006) == pytest.approx(6.25)
     assert hours_needed(0.03, 0.02, 1.0, shared_error=0.01) == math.inf

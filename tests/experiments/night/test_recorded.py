@@ -187,7 +187,7 @@ def test_slopes_that_lean_on_a_prediction(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_page(tmp_path: Path) -> None:
+def test_page_of_a_night_lists_its_blocks(tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
     page = page_of_recording(recorded_night(stored(tmp_path, alternating(3000))))
     assert [section.name for section in page.sections][-2:] == ["phase", "blocks"]

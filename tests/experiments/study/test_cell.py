@@ -117,7 +117,7 @@ def test_standard_errors_are_right() -> None:
         ),
     ],
 )
-def test_reference_cases(name: str) -> None:
+def test_reference_cases_agree(name: str) -> None:
     """R, k and their ratio within the tolerances that come with the reference.
 
     Chosen and scored on the whole sample, as there. 4 sqrt(2) standard errors, and 1 % of R for what is

@@ -227,7 +227,7 @@ def test_cameras_are_known_to_the_estimators(changes: dict[str, Any]) -> None:
     assert stated == pytest.approx(np.sqrt(np.mean(np.square(errors))), rel=0.2)
 
 
-def test_speckled_spots() -> None:
+def test_speckled_spots_choose_a_blurred_psf() -> None:
     specification = replace(
         specification_of(flux_e=200, d_over_r0=3),
         realisations=800,

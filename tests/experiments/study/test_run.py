@@ -35,7 +35,7 @@ def counting(counts: list[tuple[int, ...]]) -> WorkerPool:
 
 
 @pytest.mark.slow
-def test_in_memory(uninterrupted: Path) -> None:
+def test_study_in_memory_equals_the_stored_one(uninterrupted: Path) -> None:
     counts: list[tuple[int, ...]] = []
     result = experiments.run(SPECIFICATION, pool=counting(counts))
     assert counts == [(i, N_CELLS) for i in range(N_CELLS + 1)]
@@ -74,7 +74,7 @@ def test_other_cells_do_not_matter(uninterrupted: Path) -> None:
             np.testing.assert_array_equal(part[name][cell], same[name], err_msg=name)
 
 
-def test_bad_arguments() -> None:
+def test_study_refuses_wrong_arguments() -> None:
     with pytest.raises(InputError, match="workers = -1"):
         experiments.run(SPECIFICATION, pool=WorkerPool(-1))
     with pytest.raises(InputError, match="expected a StudySpecification"):

@@ -167,7 +167,7 @@ def test_bad_specifications_get_one_line(text: str) -> None:
         StudySpecification.from_text(text, "bad.toml")
 
 
-def test_bad_objects() -> None:
+def test_specifications_without_sweeps_are_refused() -> None:
     with pytest.raises(InputError, match="different names"):
         StudySpecification("x", [Sweep("a"), Sweep("a")])
     with pytest.raises(InputError, match="at least one sweep"):

@@ -92,7 +92,7 @@ def test_no_such_extension_no_image_no_fits(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("name", "kept"), [("a.fits", 40_000), ("a.fits.fz", -40_000)])
-def test_truncated_file(tmp_path: Path, name: str, kept: int) -> None:
+def test_truncated_fits_file_is_refused(tmp_path: Path, name: str, kept: int) -> None:
     path = save(tmp_path / name, cube(100, 20, 20))
     path.write_bytes(path.read_bytes()[:kept])
     n_bytes = path.stat().st_size
@@ -100,7 +100,7 @@ def test_truncated_file(tmp_path: Path, name: str, kept: int) -> None:
         open_frames([path])
 
 
-def test_zero_frames(tmp_path: Path) -> None:
+def test_fits_file_of_zero_frames_is_refused(tmp_path: Path) -> None:
     path = written(tmp_path / "a.fits", np.zeros((0, 4, 4), np.int16))
     with refused("at least one frame", "(0, 4, 4)"):
         open_frames([path])
@@ -120,7 +120,7 @@ def test_truncated_gzip_keeps_the_frames_before(tmp_path: Path, kept: float) -> 
         np.testing.assert_array_equal(source.block(5, 7), frames[5:7])
 
 
-def test_damaged_tile(tmp_path: Path) -> None:
+def test_damaged_fits_tile_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "a.fits.fz"
     fits.CompImageHDU(cube(100, 20, 20), compression_type="GZIP_1", tile_shape=(1, 20, 20)).writeto(path)
     content = bytearray(path.read_bytes())
@@ -201,7 +201,7 @@ def test_columns_of_a_table(tmp_path: Path, ending: str) -> None:
         ("TSCAL4", "two"),
     ],
 )
-def test_damaged_table(tmp_path: Path, card: str, value: object) -> None:
+def test_damaged_fits_table_is_refused(tmp_path: Path, card: str, value: object) -> None:
     table(tmp_path / "loop.fits")
     content = (tmp_path / "loop.fits").read_bytes()
     header = fits.Header.fromstring(content[2880 : 2880 * 3].split(b" END ")[0])

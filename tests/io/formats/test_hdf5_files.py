@@ -37,7 +37,7 @@ def test_variables_and_fields(tmp_path: Path, compressed: bool) -> None:
 
 
 @pytest.mark.parametrize("kept", [2, 4, 30, 200, -17, -5])
-def test_truncated(tmp_path: Path, kept: int) -> None:
+def test_truncated_idl_file_is_refused(tmp_path: Path, kept: int) -> None:
     path = idl_file.write(tmp_path / "trs.sav", {"rx": GAIN, "A": FIELDS})
     path.write_bytes(path.read_bytes()[:kept])
     with refused("trs.sav"):
@@ -52,7 +52,9 @@ def test_records_in_a_circle(tmp_path: Path) -> None:
         read_array(f"{path}:RX")
 
 
-def test_bomb(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_idl_records_that_inflate_too_far_are_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Records that inflate to more than the limit, here 1 MiB, are not inflated."""
     monkeypatch.setattr(hdf5_files, "MOST_WHOLE_BYTES", 1 << 20)
     assert stored_array.MOST_WHOLE_BYTES == 1 << 30

@@ -44,7 +44,7 @@ def test_pages_of_several_sizes(tmp_path: Path) -> None:
             open_frames([tmp_path / "a.tif"], key=key)
 
 
-def test_five_channels(tmp_path: Path) -> None:
+def test_tiff_of_five_channels_is_refused(tmp_path: Path) -> None:
     tifffile.imwrite(
         tmp_path / "a.tif", np.zeros((6, 8, 5), np.uint8), photometric="minisblack", planarconfig=1
     )
@@ -52,7 +52,7 @@ def test_five_channels(tmp_path: Path) -> None:
         open_frames([tmp_path / "a.tif"])
 
 
-def test_damaged_page(tmp_path: Path) -> None:
+def test_frames_before_a_damaged_tiff_page_are_read(tmp_path: Path) -> None:
     path = save(tmp_path / "deflated.tif", cube())
     with tifffile.TiffFile(path) as file:
         offset = file.pages[4].dataoffsets[0]

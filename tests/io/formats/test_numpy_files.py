@@ -44,7 +44,7 @@ def test_big_endian_becomes_native(tmp_path: Path) -> None:
         np.testing.assert_array_equal(source.block(0, 11), cube())
 
 
-def test_negative_shape(tmp_path: Path) -> None:
+def test_negative_shape_is_refused(tmp_path: Path) -> None:
     """Two negative sides make a size that a file can have."""
     with (tmp_path / "a.npy").open("wb") as file:
         header = {"descr": "<f4", "fortran_order": True, "shape": (-3, -4)}

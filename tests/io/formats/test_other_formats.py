@@ -47,7 +47,7 @@ class TestHdf5:
         with refused("no array 'link'"):
             open_frames([f"{tmp_path}/a.h5:link"])
 
-    def test_only_numbers(self, tmp_path: Path) -> None:
+    def test_arrays_of_text_and_complex_numbers_are_refused(self, tmp_path: Path) -> None:
         with h5py.File(tmp_path / "a.h5", "w") as file:
             file["text"] = [["a", "b"], ["c", "d"]]
             file["complex"] = np.ones((3, 4, 5), complex)
@@ -69,7 +69,7 @@ class TestMatlab:
         np.testing.assert_array_equal(read_array(f"{path}:matrix"), matrix)
 
     @pytest.mark.parametrize("kind", ["u1", "i2", "u2", "f4", "f8", "?"])
-    def test_types(self, tmp_path: Path, kind: str) -> None:
+    def test_matlab_types_are_kept(self, tmp_path: Path, kind: str) -> None:
         values = cube(4).astype(kind)
         scipy.io.savemat(tmp_path / "a.mat", {"b": np.moveaxis(values, 0, -1)})
         with open_frames([tmp_path / "a.mat"]) as source:
@@ -79,7 +79,7 @@ class TestMatlab:
 
 class TestImages:
     @pytest.mark.parametrize("kind", ["u1", "u2"])
-    def test_grey_png(self, tmp_path: Path, kind: str) -> None:
+    def test_grey_png_files_are_frames(self, tmp_path: Path, kind: str) -> None:
         frames = cube(2).astype(kind)
         paths = [tmp_path / "a.png", tmp_path / "b.png"]
         for path, frame in zip(paths, frames, strict=True):
@@ -117,7 +117,7 @@ class TestImages:
         with open_frames([tmp_path / "a.tif"]) as source:
             np.testing.assert_array_equal(source.block(0, 3), frames)
 
-    def test_refused(self, tmp_path: Path) -> None:
+    def test_png_files_that_are_not_grey_are_refused(self, tmp_path: Path) -> None:
         path = tmp_path / "a.png"
         Image.fromarray(np.zeros((6, 8, 3), np.uint8)).convert("P").save(path)
         with refused("expected a grey image of 8 or 16 bits, got mode P"):

@@ -13,7 +13,7 @@ POKE = np.random.default_rng(3).standard_normal((14, 5))
 
 @pytest.mark.parametrize("separator", [",", ";", " ", "\t"])
 @pytest.mark.parametrize("ending", ["txt", "csv", "dat", "TXT"])
-def test_separators(tmp_path: Path, separator: str, ending: str) -> None:
+def test_text_files_have_any_separator(tmp_path: Path, separator: str, ending: str) -> None:
     path = tmp_path / f"poke.{ending}"
     np.savetxt(path, POKE, delimiter=separator, header="poke matrix", fmt="%.17g")
     np.testing.assert_array_equal(read_array(path), POKE)

@@ -11,7 +11,7 @@ from tests.refusals import refused
 from faintspot.io import open_frames, read_array
 
 
-def test_damaged_chunk(tmp_path: Path) -> None:
+def test_frames_before_a_damaged_zarr_chunk_are_read(tmp_path: Path) -> None:
     store = save(tmp_path / "v3.zarr", cube())
     chunk = store / "c" / "1" / "0" / "0"
     chunk.write_bytes(chunk.read_bytes()[:20])

@@ -78,7 +78,7 @@ def test_removed_modes_are_not_driven() -> None:
     np.testing.assert_allclose(control.reconstructor.matrix @ TILTS, 0.0, atol=1e-12)
 
 
-def test_the_table(tmp_path: Path) -> None:
+def test_removed_modes_are_read_from_the_table(tmp_path: Path) -> None:
     path = tmp_path / "faintspot.toml"
     np.save(tmp_path / "matrix.npy", INTERACTION)
     LAYOUT.save(path)

@@ -124,6 +124,6 @@ def test_a_product_that_was_not_begun_is_the_plain_one_bit_for_bit() -> None:
     np.testing.assert_array_equal(product(vector), product.several(vector)[0])
 
 
-def test_several_vectors() -> None:
+def test_several_vectors_are_multiplied_at_once() -> None:
     vectors = np.random.default_rng(3).standard_normal((3, 2 * N))
     np.testing.assert_allclose(SlopeProduct(MATRIX).several(*vectors), vectors @ MATRIX.T, atol=TOLERANCE)

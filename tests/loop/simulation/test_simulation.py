@@ -79,7 +79,7 @@ def test_the_static_error_lowers_strehl_ratios_alone() -> None:
     np.testing.assert_array_equal(worse.commands, record.commands)
 
 
-def test_realisations_differ(record: LoopRecord) -> None:
+def test_each_realisation_differs(record: LoopRecord) -> None:
     other = simulate_loop(faint().replace("run", frames=5, settle_frames=1), [plain()], realisation=1)
     assert not np.array_equal(other.strehl[:5], record.strehl[:5])
 

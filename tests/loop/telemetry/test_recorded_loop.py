@@ -98,7 +98,7 @@ def test_control_matrix_and_mask(tmp_path: Path) -> None:
     assert loop.pixel_scale_arcsec == 1.0
 
 
-def test_aot_file(tmp_path: Path) -> None:
+def test_aot_file_is_read(tmp_path: Path) -> None:
     aotpy = pytest.importorskip("aotpy")
     found = arrays()
     mirror = aotpy.DeformableMirror("DM", n_valid_actuators=36, telescope=aotpy.MainTelescope("T"))

@@ -43,7 +43,7 @@ def test_loop_and_frames(report: LoopReport) -> None:
     assert value(report, "loop", "actuators that reached a limit").value == 0
 
 
-def test_noise(report: LoopReport) -> None:
+def test_noise_is_found_within_5_percent(report: LoopReport) -> None:
     """To 5 %: turbulence within two frames is no parabola."""
     assert value(report, "noise", "noise of a slope").value == pytest.approx(NOISE_PX, rel=0.05)
     assert report.noise_px is not None
@@ -61,7 +61,7 @@ def test_a_fast_vibration_is_no_noise() -> None:
     assert np.sqrt(np.square(noise).mean()) == pytest.approx(NOISE_PX, rel=0.03)
 
 
-def test_turbulence(report: LoopReport) -> None:
+def test_turbulence_is_found_within_its_errors(report: LoopReport) -> None:
     """Winds to 1 m/s; r0 within three errors, as ten seconds hold few independent wavefronts."""
     r0 = value(report, "turbulence", "r0 at 500 nm")
     assert abs(r0.value - AIR.r0_m) < 3 * r0.error < 0.1
@@ -134,7 +134,7 @@ def test_vibrations_in_nm_are_those_of_the_wavefront() -> None:
     assert (tip.unit, focus.unit) == ("nm", "px")
 
 
-def test_other_choices(report: LoopReport) -> None:
+def test_filter_leaves_less_than_the_best_integrator(report: LoopReport) -> None:
     """The filter leaves less than the best integrator; an integrator of the loop's gain leaves as much."""
     found = {each.name: each for each in report.choices if each.name != "integrator"}
     assert found[FILTER].residual.value < found[BEST].residual.value
@@ -203,7 +203,7 @@ def test_limits_of_actuators() -> None:
     assert found.value == np.count_nonzero((np.abs(loop.commands[rows]) >= limit).any(axis=0))
 
 
-def test_without_commands() -> None:
+def test_without_commands_turbulence_is_missing() -> None:
     loop = replace(recorded(), commands=None, interaction_matrix=None)
     report = report_of_loop(loop)
     assert "no commands" in report.parts["turbulence"].missing
@@ -211,7 +211,7 @@ def test_without_commands() -> None:
     assert not report.choices
 
 
-def test_open_loop() -> None:
+def test_open_loop_has_noise_and_no_delay() -> None:
     """An open loop has no delay; its turbulence is known all the same."""
     loop = recorded()
     assert loop.commands is not None
@@ -228,7 +228,7 @@ def test_open_loop() -> None:
     assert report.parts["turbulence"].values
 
 
-def test_few_frames() -> None:
+def test_few_frames_are_too_few_for_noise_and_turbulence() -> None:
     loop = recorded()
     assert loop.commands is not None
     report = report_of_loop(
@@ -247,7 +247,7 @@ def test_large_slopes_not_measured() -> None:
     assert not report.parts["turbulence"].values
 
 
-def test_constant_slopes() -> None:
+def test_constant_slopes_are_refused() -> None:
     loop = recorded()
     with pytest.raises(InputError, match="expected slopes that vary"):
         report_of_loop(replace(loop, slopes=np.full_like(loop.slopes, 0.1)))

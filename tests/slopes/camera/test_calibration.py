@@ -25,7 +25,7 @@ class TestMaps:
         assert np.array_equal(maps[0], dark)
         assert np.allclose(maps[1], 20.0 / (500.0 * flat), rtol=1e-6)
 
-    def test_bad_pixels(self) -> None:
+    def test_bad_pixels_become_nan_in_the_maps(self) -> None:
         flat = np.ones((3, 4))
         flat[0] = [0.0, -1.0, np.nan, np.inf]
         dark = np.zeros((3, 4))
@@ -43,7 +43,7 @@ class TestMaps:
         mask = np.array([[True, False], [False, False], [True, False]])
         assert np.array_equal(np.isnan(fs.Calibration(bad_pixels=mask).maps((3, 2))[1]), mask)
 
-    def test_beyond_float32(self) -> None:
+    def test_values_beyond_float32_are_bad_pixels(self) -> None:
         dark, flat = np.zeros((2, 2)), np.ones((2, 2))
         dark[0, 0], flat[0, 1], flat[1, 0] = 1e300, 1e-100, 5e-324
         maps = fs.Calibration(dark, flat).maps((2, 2))
@@ -86,7 +86,7 @@ def test_calibrations_are_equal_if_all_their_parts_are() -> None:
     assert fs.Calibration() != 1
 
 
-def test_bad_values() -> None:
+def test_calibrations_out_of_range_are_refused() -> None:
     map_, other = np.zeros((3, 4)), np.ones((4, 3))
     noise = [np.array([[1.0, -1.0], [np.nan, 1.0]]), np.full((3, 4), np.nan), np.full((3, 4), np.inf)]
     assert_each_refused(

@@ -52,7 +52,7 @@ class TestNoise:
         )
         assert typical == pytest.approx(1.0, rel=0.1)
 
-    def test_noiseless_frames(self) -> None:
+    def test_noiseless_frames_have_no_noise(self) -> None:
         pixels = measured(Detector(0.0, offset_adu=5.0), 12)
         assert np.all(pixels.noise_adu == 0)
         assert not len(pixels.blinking)
@@ -96,6 +96,6 @@ class TestBlinking:
         normal = np.random.default_rng(8).standard_normal((20_000, 1))
         assert two_level_fraction(normal)[0] == pytest.approx(1 - 2 / np.pi, abs=0.01)
 
-    def test_hot_pixels(self) -> None:
+    def test_hot_pixels_are_found(self) -> None:
         detector = Detector(1.0, hot_pixels=[(9, 9, 400.0)])
         assert measured(detector, 30).hot.tolist() == [[9, 9]]

@@ -84,7 +84,7 @@ def test_full_well_limits_the_electrons() -> None:
     assert np.all(detector.expose(np.full((5, 5), 500.0), np.random.default_rng(0)) == 100)
 
 
-def test_adu_convention() -> None:
+def test_electrons_follow_from_gain_offset_and_em_gain() -> None:
     detector = Detector(0.0, gain_e_per_adu=2.5, offset_adu=300.0)
     adu = detector.expose(np.full((30, 30), 8.0), np.random.default_rng(5))
     plain = Detector(0.0).expose(np.full((30, 30), 8.0), np.random.default_rng(5))

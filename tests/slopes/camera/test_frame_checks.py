@@ -61,7 +61,7 @@ def test_known_bad_pixels_are_left_out_and_the_frame_is_not_changed() -> None:
     ("frame", "threshold", "named"),
     [(np.zeros(3), 8, "frame"), (np.zeros((2, 3, 3)), 8, "frame"), (np.zeros((3, 3)), 0, "threshold")],
 )
-def test_bad_input(frame: object, threshold: float, named: str) -> None:
+def test_hot_pixels_need_a_frame_and_a_threshold(frame: object, threshold: float, named: str) -> None:
     with pytest.raises(fs.InputError, match=named):
         find_hot_pixels(frame, threshold=threshold)  # type: ignore[arg-type]
 

@@ -17,7 +17,7 @@ every_dtype = pytest.mark.parametrize("dtype", [np.float32, np.float64])
 
 @every_dtype
 @given(images())
-def test_equals_oracle(dtype: Any, stack: Any) -> None:
+def test_centre_of_gravity_equals_the_oracle(dtype: Any, stack: Any) -> None:
     stack = np.abs(stack).astype(dtype)  # where signs cancel the quotient of two rounded sums is anything
     stack[np.abs(stack) < 1e-30] = 0
     result = fs.centre_of_gravity(stack)
@@ -29,7 +29,7 @@ def test_equals_oracle(dtype: Any, stack: Any) -> None:
 
 @every_dtype
 @pytest.mark.parametrize("value", [0.0, -1.0, -1e-44])
-def test_without_flux(dtype: Any, value: float) -> None:
+def test_images_without_flux_have_their_centre(dtype: Any, value: float) -> None:
     assert np.array_equal(fs.centre_of_gravity(np.full((3, 4, 4), value, dtype)), np.zeros((3, 2)))
 
 
@@ -39,7 +39,7 @@ def test_sum_that_cancels_is_never_nan() -> None:
 
 
 @every_dtype
-def test_however_faint(dtype: Any) -> None:
+def test_faintest_images_have_the_same_centre(dtype: Any) -> None:
     """Values of 1 to 100 smallest steps of the type, and the same image as it usually is."""
     generator = np.random.default_rng(4)
     stack = generator.integers(0, 100, (5, 6, 7)).astype(dtype)
@@ -61,7 +61,7 @@ def test_sum_that_cancels_but_for_almost_nothing(dtype: Any) -> None:
 
 
 @pytest.mark.parametrize("leading", [(), (3,), (2, 3)])
-def test_leading_shapes(leading: tuple[int, ...]) -> None:
+def test_leading_dimensions_are_kept(leading: tuple[int, ...]) -> None:
     g = np.random.default_rng(1).random((*leading, 6, 4))
     copy = g.copy()
     g.flags.writeable = False
@@ -89,7 +89,7 @@ every_rule = pytest.mark.parametrize("rule", RULES)
 @every_dtype
 @every_rule
 @given(images(), st.floats(0.0, 1.0))
-def test_equals_sorting(rule: str, dtype: Any, stack: Any, fraction: float) -> None:
+def test_brightest_pixels_equal_sorting(rule: str, dtype: Any, stack: Any, fraction: float) -> None:
     """Exactly: the threshold is a pixel value, and one subtraction rounds the same everywhere."""
     stack = stack.astype(dtype)
     pixels = stack[0].size
@@ -143,7 +143,7 @@ def test_brightest_pixels_refuse_bad_images(bad: Any, words: str) -> None:
         fs.brightest_pixels(bad, 1)
 
 
-def test_one_pixel() -> None:
+def test_brightest_pixels_of_one_pixel_are_refused() -> None:
     with refused("images", "at least 2 pixels"):
         fs.brightest_pixels(np.ones((3, 1, 1)), 1)
 
@@ -164,7 +164,7 @@ def test_one_pixel() -> None:
         ([], "empty"),
     ],
 )
-def test_bad_number(keep: Any, words: str) -> None:
+def test_numbers_of_pixels_out_of_range_are_refused(keep: Any, words: str) -> None:
     with refused("keep", words):
         fs.brightest_pixels(np.ones((3, 4, 4)), keep)
 
@@ -178,7 +178,7 @@ def test_most_that_each_rule_keeps() -> None:
 
 
 @pytest.mark.parametrize("rule", ["max", None, 1, ["threshold"]])
-def test_unknown_rule(rule: Any) -> None:
+def test_unknown_rule_is_refused(rule: Any) -> None:
     with refused("rule", "'subtract_next', 'threshold', 'subtract_kth'"):
         fs.brightest_pixels(np.eye(4), 3, rule=rule)
 
@@ -206,7 +206,7 @@ def test_width_and_flux_wherever_the_spots_are(flux_e: float, read_noise_e: floa
         assert found.flux == pytest.approx(scale * flux_e, rel=0.1)
 
 
-def test_without_spots() -> None:
+def test_images_without_spots_are_refused() -> None:
     with refused("images", "found none"):
         seen_spots(np.ones((5, 8, 8)))
     with refused("images", "4 x 4"):

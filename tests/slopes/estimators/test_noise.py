@@ -36,12 +36,12 @@ def test_pixel_noise_of_normal_noise() -> None:
 
 
 @pytest.mark.parametrize(("bad", "words"), BAD_IMAGES)
-def test_bad_images(bad: Any, words: str) -> None:
+def test_pixel_noise_refuses_wrong_images(bad: Any, words: str) -> None:
     with refused("images", words):
         pixel_noise(bad)
 
 
-def test_one_column() -> None:
+def test_pixel_noise_of_one_column_is_refused() -> None:
     with refused("images", "2 columns"):
         pixel_noise(np.ones((4, 1)))
 

@@ -92,7 +92,7 @@ def test_what_is_returned_is_a_copy() -> None:
 
 
 @pytest.mark.parametrize("name", ["newton", "", 3, None, ["ml"]])
-def test_unknown_names(name: Any) -> None:
+def test_unknown_estimator_is_refused(name: Any) -> None:
     with refused(f"estimator = {name!r}: expected one of 'brightest', 'tv', 'smoothed'"):
         estimator_named(name)
 

@@ -230,7 +230,7 @@ class TestTooStrong:
 
 
 class TestArguments:
-    def test_leading_shapes(self) -> None:
+    def test_leading_dimensions_are_kept(self) -> None:
         g = np.random.default_rng(9).normal(size=(3, 4, 6, 5)).astype(np.float32)
         whole = fs.tv_denoise(g, 0.5, full_output=True)
         assert whole.images.shape == (3, 4, 6, 5)
@@ -278,7 +278,7 @@ class TestArguments:
         assert np.array_equal(strengths, copies[1])
 
     @pytest.mark.parametrize(("bad", "words"), BAD_IMAGES)
-    def test_bad_images(self, bad: Any, words: str) -> None:
+    def test_denoising_refuses_wrong_images(self, bad: Any, words: str) -> None:
         with refused("images", words):
             fs.tv_denoise(bad, 0.5)
 
@@ -287,7 +287,7 @@ class TestArguments:
             with refused("images", "at least 2 x 2"):
                 fs.tv_denoise(np.ones(shape), 0.5)
 
-    def test_bad_arguments(self) -> None:
+    def test_denoising_refuses_wrong_arguments(self) -> None:
         assert_each_refused(
             partial(fs.tv_denoise, np.ones((3, 4, 4)), noise_std=0.5),
             noise_std=[-0.1, np.nan, np.inf, [0.1, 0.2], np.ones((3, 1)), "strong", None, 1j, []],
@@ -322,7 +322,7 @@ class TestIndependence:
                 assert np.array_equal(getattr(part, field), getattr(whole, field)[select]), field
 
     @every_dtype
-    def test_of_threads(self, dtype: Any) -> None:
+    def test_several_threads_give_the_same_images(self, dtype: Any) -> None:
         stack = np.random.default_rng(16).normal(size=(1200, 4, 5)).astype(dtype)
         strengths = np.linspace(0, 1.1, len(stack))
         whole = fs.tv_denoise(stack, strengths)  # enough groups for several threads

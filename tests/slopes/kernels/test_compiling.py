@@ -255,7 +255,7 @@ def test_target_of_this_process() -> None:
 
 
 @pytest.mark.slow
-def test_generic_processor(tmp_path: Path) -> None:
+def test_generic_processor_measures(tmp_path: Path) -> None:
     """As on clusters whose nodes differ; code for more than the target has would end the process."""
     environment = {
         name: value for name, value in os.environ.items() if not name.startswith(("NUMBA_", "FAINTSPOT_SIMD"))

@@ -43,7 +43,7 @@ def number_of(row: int, column: int) -> int:
 
 class TestAgainstOracle:
     @given(seed=st.integers(0, 2**32 - 1))
-    def test_random_layouts(self, seed: int) -> None:
+    def test_random_layouts_equal_the_oracle(self, seed: int) -> None:
         rng = np.random.default_rng(seed)
         rows, columns = (int(n) for n in rng.integers(1, 9, 2))
         layout = fs.Layout.grid((rows, columns), pixels=12, pitch=14, origin=(3, 3), frame_shape=(130, 130))
@@ -63,7 +63,7 @@ class TestAgainstOracle:
         expected = naive.doubtful(slopes, layout, fwhm[:, None], reference)
         assert np.array_equal(slopes.flags, before[0] | expected)
 
-    def test_hexagonal_neighbours(self) -> None:
+    def test_hexagonal_neighbours_are_compared(self) -> None:
         rows, columns = np.divmod(np.arange(25), 5)
         centres = np.column_stack([20.0 + 14 * columns + 7 * rows, 20.0 + 13 * rows])
         corners = np.floor(centres[:, ::-1] - 5.5).astype(int)
@@ -81,7 +81,7 @@ class TestSecondSpots:
     """A reflection beside the spot or in place of it, which pulls less than displacements differ."""
 
     @pytest.mark.parametrize(("flux", "flagged"), [(1.0, False), (1.6, True), (0.5, False), (0.16, True)])
-    def test_flux_decides(self, flux: float, flagged: bool) -> None:
+    def test_flux_decides_on_doubtful_spots(self, flux: float, flagged: bool) -> None:
         arrays = SlopeArrays(*(np.zeros((1, N), kind) for kind in RESULT_TYPES))
         arrays.x[0], arrays.y[0] = np.random.default_rng(1).uniform(-0.25, 0.25, (2, N))
         arrays.flux[0] = 1000.0

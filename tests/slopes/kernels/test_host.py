@@ -33,7 +33,7 @@ def test_width_of_the_machine_and_the_environment(monkeypatch: pytest.MonkeyPatc
 
 
 @pytest.mark.parametrize("width", [0, 2, 5, 32, "wide", 8.5])
-def test_other_widths(width: Any) -> None:
+def test_other_simd_widths_are_refused(width: Any) -> None:
     with refused("SIMD width", "4, 8 or 16"):
         lanes_for(np.float32, width)
 

@@ -218,7 +218,7 @@ def test_comments_and_other_tables_stay(tmp_path: Path) -> None:
     assert fs.Settings.load(path).noise_std == 2.5
 
 
-def test_to_text(tmp_path: Path) -> None:
+def test_configuration_survives_its_text(tmp_path: Path) -> None:
     parts = fs.Layout.grid((2, 3), pixels=4), fs.Settings(noise_std=1.0)
     path = written(tmp_path, configuration.to_text(*parts))
     described = configuration.Configuration(path)
@@ -247,7 +247,7 @@ def test_a_grid_is_the_layout_of_its_numbers(tmp_path: Path) -> None:
     assert len(expected) == 36
 
 
-def test_some_subapertures(tmp_path: Path) -> None:
+def test_some_subapertures_have_other_values(tmp_path: Path) -> None:
     path = written(
         tmp_path,
         '[estimator]\nname = "tv"\nnoise_std = { default = 2.5, 4 = 3.0 }\n'
@@ -301,7 +301,7 @@ def estimator(text: str) -> str:
         ("not a TOML file", "[settings\nnoise_std = 1"),
     ],
 )
-def test_bad_settings(words: str, text: str, tmp_path: Path) -> None:
+def test_damaged_settings_are_refused(words: str, text: str, tmp_path: Path) -> None:
     path = written(tmp_path, text)
     with refused(f"{path}: ", words):
         fs.Settings.load(path)
@@ -323,7 +323,7 @@ def test_bad_settings(words: str, text: str, tmp_path: Path) -> None:
         ("layout.grid.outer_radius = 0.1", f"{LAYOUT}outer_radius = 0.1"),
     ],
 )
-def test_bad_layout(words: str, text: str, tmp_path: Path) -> None:
+def test_damaged_layout_is_refused(words: str, text: str, tmp_path: Path) -> None:
     path = written(tmp_path, text)
     with refused(f"{path}: {words}"):
         fs.Layout.load(path)
@@ -341,7 +341,7 @@ def test_bad_layout(words: str, text: str, tmp_path: Path) -> None:
         ("calibration.saturation_adu", "saturation_adu = [1.0]"),
     ],
 )
-def test_bad_calibration(words: str, text: str, tmp_path: Path) -> None:
+def test_damaged_calibration_is_refused(words: str, text: str, tmp_path: Path) -> None:
     path = written(tmp_path, f"[calibration]\n{text}\n")
     with refused(f"{path}: ", words):
         fs.Calibration.load(path)

@@ -147,7 +147,7 @@ def test_an_ambiguous_first_frame_has_no_valid_slope() -> None:
     assert (slopes.flags[slopes.measured] & int(FLAG.UNLIKE_NEIGHBOURS)).all()
 
 
-def test_binned_frames() -> None:
+def test_binned_frames_are_followed() -> None:
     record = recording(2008, Case(frames=10, missing=0.0))
     big = record.frames.repeat(2, axis=1).repeat(2, axis=2) / 4
     pipeline = record.pipeline()

@@ -19,7 +19,7 @@ class TestAgainstOracle:
     @pytest.mark.parametrize("dtype", DTYPES)
     @given(seed=st.integers(0, 2**32 - 1))
     @examples(8)
-    def test_random_sensors(self, dtype: str, seed: int) -> None:
+    def test_random_sensors_equal_the_oracle(self, dtype: str, seed: int) -> None:
         case = random_case(seed, dtype)
         assert_equals_oracle(case, case.pipeline()(case.frame))
 
@@ -111,7 +111,7 @@ class TestFrames:
         case.pipeline().explain(case.frame)
         assert np.array_equal(case.frame, copy, equal_nan=True)
 
-    def test_wrong_frames(self) -> None:
+    def test_frames_of_another_sensor_are_refused(self) -> None:
         pipeline = random_case(5, "uint16").pipeline()
         for bad, words in (
             (np.zeros((60, 61)), "(60, 60) or (n, 60, 60), got (60, 61)"),
@@ -197,11 +197,11 @@ class TestSettings:
             fs.SlopePipeline(layout, settings, fs.Calibration(bad_pixels=[[0, 0], [8, 0]]))
 
     @pytest.mark.parametrize(("name", "value"), [("width", 5), ("threads", 0), ("threads", 1.5)])
-    def test_bad_options(self, name: str, value: Any) -> None:
+    def test_pipeline_refuses_wrong_options(self, name: str, value: Any) -> None:
         with refused(name):
             fs.SlopePipeline(fs.Layout.grid((2, 2), pixels=4), fs.Settings(noise_std=1), **{name: value})
 
-    def test_reference_forms(self) -> None:
+    def test_reference_has_three_equal_forms(self) -> None:
         case = random_case(7, "float32")
         frame = np.nan_to_num(case.frame, nan=20.0, posinf=20.0, neginf=20.0)
 

@@ -41,7 +41,7 @@ class TestBadFrames:
 
     @pytest.mark.parametrize("dtype", [np.float32, np.float64])
     @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 3e38])
-    def test_nothing_finite(self, value: float, dtype: Any) -> None:
+    def test_frames_without_a_finite_pixel_are_flagged(self, value: float, dtype: Any) -> None:
         slopes = self.measure(np.full((30, 30), value, dtype))
         assert np.all(slopes.flags == Flag.TOO_MANY_BAD_PIXELS)
         assert np.all(slopes.bad_pixels == 36)
@@ -95,7 +95,7 @@ class TestBadFrames:
         assert slopes.flags[1] & Flag.TOO_MANY_BAD_PIXELS == 0
 
     @given(seed=st.integers(0, 2**32 - 1))
-    def test_hostile_values(self, seed: int) -> None:
+    def test_hostile_values_equal_the_oracle(self, seed: int) -> None:
         rng = np.random.default_rng(seed)
         values = [
             0.0,

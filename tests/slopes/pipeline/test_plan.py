@@ -42,7 +42,9 @@ class TestWhatIsMissing:
             (fs.Settings("thresholded"), {}, r"estimator\.threshold_e"),
         ],
     )
-    def test_is_named(self, settings: fs.Settings, parts: dict[str, Any], message: str) -> None:
+    def test_what_an_estimator_lacks_is_named(
+        self, settings: fs.Settings, parts: dict[str, Any], message: str
+    ) -> None:
         with pytest.raises(fs.InputError, match=message):
             fs.SlopePipeline(LAYOUT, settings, **{"calibration": NOISE, **parts})
 
@@ -94,7 +96,7 @@ class TestConfiguration:
         expected = fs.SlopePipeline(LAYOUT, fs.Settings(estimator="ml"), NOISE, psf=psf)(frame)
         assert np.array_equal(fs.SlopePipeline.from_file(path)(frame).x, expected.x)
 
-    def test_analytic_psf(self, tmp_path: Path) -> None:
+    def test_analytic_psf_is_read_from_the_table(self, tmp_path: Path) -> None:
         path = tmp_path / "faintspot.toml"
         for item in (LAYOUT, fs.Settings(estimator="ml"), NOISE):
             configuration.save(path, item)

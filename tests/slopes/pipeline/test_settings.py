@@ -20,7 +20,7 @@ class TestSettings:
         assert settings != fs.Settings(noise_std=0.5, keep_brightest=8)
         assert settings != 0.5
 
-    def test_is_immutable(self) -> None:
+    def test_settings_are_immutable(self) -> None:
         settings = fs.Settings(noise_std=1.0)
         with pytest.raises(AttributeError, match=r"settings\.replace\(algorithm="):
             settings.algorithm = "chambolle"
@@ -58,7 +58,7 @@ class TestSettings:
             ),
         ],
     )
-    def test_bad_values(self, words: str, arguments: dict[str, Any]) -> None:
+    def test_settings_out_of_range_are_refused(self, words: str, arguments: dict[str, Any]) -> None:
         with refused(words):
             fs.Settings(**{"noise_std": 1.0, **arguments})
 

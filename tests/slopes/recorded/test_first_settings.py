@@ -77,7 +77,7 @@ def test_spots_that_move_more_get_a_larger_range(range_px: float) -> None:
     assert range_px < reach < 2 * range_px + 6.0
 
 
-def test_no_spots() -> None:
+def test_without_spots_the_reference_is_the_answer() -> None:
     """The reference is the best answer."""
     noise = np.random.default_rng(1).normal(0.0, 3.0, (1, N * 16, 16))
     layout = fs.Layout.stacked(N, (16, 16))

@@ -72,12 +72,12 @@ def test_one_frame_says_that_there_is_no_jitter() -> None:
 
 
 @pytest.mark.slow
-def test_one_subaperture() -> None:
+def test_page_of_one_subaperture() -> None:
     layout = sensor((1, 1))
     assert "1 of 8 × 8 px" in page_of(layout, *simulated(layout, 3)).text
 
 
-def test_everything_invalid() -> None:
+def test_page_says_when_everything_is_invalid() -> None:
     layout = sensor()
     page = page_of(layout, np.full((3, *layout.frame_shape), np.nan, np.float32), np.zeros((3, 9, 2)))
     assert "No measurement is valid" in page.text

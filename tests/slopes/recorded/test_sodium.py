@@ -103,7 +103,7 @@ def test_command_reads_as_many_frames_as_stated(recording: Path, run: Commands, 
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("undrawn_pictures")
-def test_command(recording: Path, run: Commands) -> None:
+def test_sodium_command_writes_what_the_pipeline_knows(recording: Path, run: Commands) -> None:
     """What the command has learnt is what a pipeline of the configuration then knows."""
     path = recording / "faintspot.toml"
     for item in (LAYOUT, calibration(), fs.Settings("ml", search_range_px=2.0)):

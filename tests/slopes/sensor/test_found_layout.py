@@ -264,6 +264,8 @@ def test_the_fraction_decides() -> None:
         (np.ones((20, 20)), (10, 10), {"roi": (0, 0, 30, 20)}, "roi"),
     ],
 )
-def test_refused(image: NDArray[Any], shape: tuple[int, int], options: dict[str, Any], naming: str) -> None:
+def test_known_grid_refuses_wrong_input(
+    image: NDArray[Any], shape: tuple[int, int], options: dict[str, Any], naming: str
+) -> None:
     with pytest.raises(InputError, match=naming):
         find_illuminated(image, shape, **options)

@@ -36,7 +36,7 @@ class TestGrid:
             with pytest.raises(fs.InputError, match=f"layout.{name} = .*got true or false"):
                 fs.Layout((16, 16), (8, 8), **values)
 
-    def test_places(self) -> None:
+    def test_grid_places_windows_row_by_row(self) -> None:
         layout = fs.Layout.grid((2, 3), pixels=(4, 6), pitch=(5, 8), origin=(1, 2))
         assert layout.corners.tolist() == [[1, 2], [1, 10], [1, 18], [6, 2], [6, 10], [6, 18]]
         assert layout.cells.tolist() == [[i, j] for i in range(2) for j in range(3)]
@@ -47,7 +47,7 @@ class TestGrid:
         assert layout.pitch_px == 5.0
         assert np.array_equal(layout.offsets, np.zeros((6, 2)))
 
-    def test_bad_arguments(self) -> None:
+    def test_grid_refuses_wrong_arguments(self) -> None:
         good = partial(fs.Layout.grid, shape=(7, 7), pixels=4)
         assert_each_refused(
             good,
@@ -90,7 +90,7 @@ class TestLayout:
         assert layout.window == (4, 4)
         assert layout.offsets.tolist() == [[0.5, -0.5], [0.0, 0.0]]
 
-    def test_bad_arguments(self) -> None:
+    def test_layout_refuses_wrong_arguments(self) -> None:
         beyond = [[[3.5, 3.5], [1e39, 3.5]], [[3.5, -21.0], [11.5, 3.5]]]
         assert_each_refused(
             partial(fs.Layout, frame_shape=(8, 16), window=(8, 8), corners=np.array([[0, 0], [0, 8]])),
@@ -171,7 +171,7 @@ class TestImages:
         assert np.array_equal(layout.images(cube)[1], -layout.images(frame))
         assert layout.images(frame).dtype == frame.dtype
 
-    def test_wrong_shape(self) -> None:
+    def test_frames_of_another_shape_are_refused(self) -> None:
         with refused("frame", "(8, 8)", "(8, 9)"):
             fs.Layout.grid((2, 2), pixels=4).images(np.zeros((8, 9)))
 

@@ -138,7 +138,7 @@ def test_saturated_pixels_that_count() -> None:
     assert ((flags & fs.SubapertureFlag.SATURATED) != 0).tolist() == [True, False]
 
 
-def test_quad_cells() -> None:
+def test_quad_cells_are_sums_of_four_pixels() -> None:
     """Sums of four pixels, with the gain of the spot."""
     cell = np.array([[-1.0, 1.0], [-1.0, 1.0]])
     weights = fs.FixedWeights(0.5 * cell, 0.5 * cell.T, np.full((2, 2), 0.25))

@@ -72,7 +72,7 @@ def test_blurring_adds_its_variance() -> None:
 
 
 @pytest.mark.parametrize(("options", "rank"), [(SHAPES[0], 1), (SHAPES[2], 1), (SHAPES[3], 5)])
-def test_separable_terms(options: dict[str, Any], rank: int) -> None:
+def test_separable_terms_reproduce_the_psf(options: dict[str, Any], rank: int) -> None:
     psf = analytic(options, radius_px=10)
     along_x, along_y = psf.separable_terms
     assert along_x.shape[1] == along_y.shape[1] <= rank

@@ -35,7 +35,7 @@ def test_the_mean_counts_each_by_its_error() -> None:
     assert CentroidGain(found.gain, np.zeros((2, 2))).mean == (3.75, 0.0)
 
 
-def test_quad_cells() -> None:
+def test_quad_cells_show_their_centroid_gain() -> None:
     """A quad cell's slope is that of its halves; spots 1.3 times as wide show by how much less it moves."""
     pixels = 2
     layout = fs.Layout.grid((2, 2), pixels=pixels)

@@ -102,7 +102,7 @@ def test_the_read_noise_is_measured_and_the_start_may_be_given() -> None:
         assert learnt.psf.samples.shape == (1, 25, 25)
 
 
-def test_multiplied_electrons() -> None:
+def test_psf_is_learnt_from_multiplied_electrons() -> None:
     rng = np.random.default_rng(10)
     psf = true_psf("gaussian")
     positions = rng.uniform(-2, 2, (600, 2))
@@ -145,7 +145,7 @@ def test_refused_in_one_line() -> None:
             learn_psf_from_images(images)
 
 
-def test_wrong_scope() -> None:
+def test_unknown_scope_is_refused() -> None:
     layout = Layout((16, 32), (16, 16), np.array([[0, 0], [0, 16]]))
     for scope in ("pupil", [1, 2, 3]):
         with pytest.raises(InputError, match="scope"):

@@ -71,7 +71,7 @@ def test_the_spot_is_found_with_the_profile() -> None:
     assert distance(found.profile) < 0.06
 
 
-def test_running_means() -> None:
+def test_running_means_forget_slowly() -> None:
     rng = np.random.default_rng(3)
     frames, slopes = rng.normal(size=(12, 4, 5, 6)), rng.normal(size=(12, 4, 2))
     mean = MeanImages(frames[:2], slopes[:2], time_constant_frames=100.0)

@@ -51,7 +51,7 @@ def test_sizes_are_those_of_the_lit_part() -> None:
 
 
 @pytest.mark.parametrize(("frames", "reference"), [(1, 0), (3, 6)])
-def test_intervals_hold(frames: int, reference: int) -> None:
+def test_rms_intervals_hold(frames: int, reference: int) -> None:
     """Sizes from 0 to far above the noise: of 40 intervals, 5 misses or fewer have a probability of 99 %."""
     held, errors = [], []
     layout = Layout.grid((5, 5), pixels=8)

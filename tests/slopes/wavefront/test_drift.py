@@ -35,7 +35,7 @@ def test_a_drift_of_a_thousandth_of_a_pixel_is_seen() -> None:
     np.testing.assert_allclose(found.mean.mean(axis=0), drifting(change, 1).mean, atol=1e-12)
 
 
-def test_intervals_hold() -> None:
+def test_drift_intervals_hold() -> None:
     """Of 30 recordings with 9 modes: 95 % with a standard error of 1.3 %; errors those of the scatter."""
     fits = [fit_drift(drifting(0.01, seed, 100), 10) for seed in range(30)]
     true = np.zeros(9)
@@ -47,7 +47,7 @@ def test_intervals_hold() -> None:
     np.testing.assert_allclose(np.delete(stated, 4), np.delete(scatter, 4), rtol=0.15)
 
 
-def test_bad_input() -> None:
+def test_drift_of_too_few_frames_is_refused() -> None:
     wavefront = drifting(0.0, 1)
     with pytest.raises(InputError, match="bins"):
         fit_drift(wavefront, 2)

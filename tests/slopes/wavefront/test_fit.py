@@ -130,7 +130,7 @@ def test_number_of_modes_follows_the_sensor(n_side: int, expected: int) -> None:
     assert found.condition <= 20
 
 
-def test_bad_input() -> None:
+def test_too_many_modes_are_refused() -> None:
     slopes = slopes_of(np.zeros((2, 2, len(LAYOUT))))
     with pytest.raises(InputError, match="modes = 44: 36 valid sub-apertures cannot separate so many"):
         fit_wavefront(slopes, LAYOUT, modes=44)

@@ -100,7 +100,7 @@ class FaintspotSlopec(Slopec):  # type: ignore[misc]
         self.recorded = Slopes(
             self.nslopes(), interleave=interleave, target_device_idx=self.target_device_idx
         )
-        """As `out_slopes`, but NaN where not measured."""
+        """Copy of `out_slopes`, with NaN for slopes that are not valid."""
         self.inputs["in_predicted"] = InputValue(type=Slopes, optional=True)
         self.outputs["out_recorded"] = self.recorded
         self.outputs["out_subapdata"] = subapdata

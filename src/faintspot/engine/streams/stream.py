@@ -195,7 +195,7 @@ class StreamCounters:
 
 
 class Follower:
-    """Connection to a named stream. The stream may be missing, unusable, removed or recreated.
+    """Connection to a named stream, which may be missing, unusable, removed or recreated.
 
     Parameters
     ----------

@@ -38,7 +38,7 @@ class PaperColumn:
     paper_mean: Estimate
     our_mean: Estimate
     chi_square: float
-    """Of the paper's differences against ours, over the sets."""
+    """Chi-square of the paper's differences against ours, over the sets."""
     probability: float
     """Probability of such a chi-square or more where both measure the same."""
     chance: float
@@ -67,7 +67,7 @@ class PaperComparison:
     every: PaperColumn
     best: PaperColumn
     means: Floats
-    """Of the night, as `PAPER_MEANS`."""
+    """Mean values of the night, in the order of `PAPER_MEANS`."""
     chance_of_any: float
     """Probability that some range as wide as `BEST_STRENGTHS` shows the paper's difference by chance."""
 

@@ -1,4 +1,4 @@
-"""Where denoising pays in a closed loop: methods over flux, read noise and turbulence."""
+"""Map of closed-loop gains by denoising: methods over flux, read noise and turbulence."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ class LoopCell:
     camera: str
     photons: float
     strehl: Mapping[str, Estimate]
-    """Of each method, over realisations."""
+    """Strehl ratio of each method, over realisations."""
     gain: Estimate
     """Strehl ratio with TV less that without, paired."""
     winner: str

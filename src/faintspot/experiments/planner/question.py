@@ -49,7 +49,7 @@ def default_search_range_px(fwhm_px: float) -> float:
 
 @dataclass(frozen=True, eq=False)
 class Recorded:
-    """What recorded frames tell beside camera and spots."""
+    """Properties of recorded frames beside camera and spots."""
 
     frames: NDArray[Any] | None = None
     """(n_frames, h, w) ADU, not used for the values of the question, on which promised errors are checked;
@@ -61,7 +61,7 @@ class Recorded:
     flux_is_measured: bool = False
     """Whether the flux is that of the recording, and not of a star that is asked about."""
     facts: tuple[str, ...] = ()
-    """Where the values came from, for the answer's account of what it rests on."""
+    """Sources of the values, listed with the answer."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -230,7 +230,7 @@ class Question(StarLight, StatedOptics, StatedCamera):
 
     @property
     def facts(self) -> tuple[str, ...]:
-        """Where measured values came from."""
+        """Sources of measured values."""
         return () if self.recorded is None else self.recorded.facts
 
     @property

@@ -59,7 +59,7 @@ class Findings:
     saturation_adu: float | None = None
     """Saturation level found in the frames, where the configuration states none."""
     background: str = ""
-    """What was taken off instead of an estimated dark that does not fit the frames."""
+    """Level subtracted instead of an estimated dark that does not fit the frames."""
     doubtful: bool = False
     """Whether the layout has doubts that nobody has settled."""
 
@@ -100,7 +100,7 @@ class Reading(TypedDict, total=False):
     """Choice of arrays in files of frames, see `faintspot.io.open_frames`."""
 
     key: str | None
-    """Which array of the files to read, where they hold several."""
+    """Name of the array to read from files that hold several."""
     time_axis: int | None
     """Axis of cubes that counts the frames: 0, 1 or 2."""
 
@@ -113,8 +113,8 @@ class Choices(Reading, total=False):
     changes: Mapping[str, Any] | None
     """New values of settings by name, instead of those in the configuration; "estimator" is one."""
     unit: str
-    """Of positions and standard errors in the output: "px" (default), or "arcsec", which needs the layout's
-    `pixel_scale_arcsec`."""
+    """Unit of positions and standard errors in the output: "px" (default), or "arcsec", which needs the
+    layout's `pixel_scale_arcsec`."""
     mean_flux: bool
     """Whether to tell the estimator the mean flux of every sub-aperture over the recording, instead of
     letting it take that of each frame: better where the star is faint and steady; see

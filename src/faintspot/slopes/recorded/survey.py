@@ -190,7 +190,7 @@ def response(pipeline: SlopePipeline, mean_frame: Floats, frames: Iterable[NDArr
 
     Slopes with fixed weights are linear in the pixels: their mean change, when all spots are displaced, is
     the change for the displaced mean of the frames. Others are measured in single frames displaced by whole
-    pixels, which leave the noise as it is. The mean change over Gaussian displacements is the regression of
+    pixels, which leave the noise unchanged. The mean change over Gaussian displacements is the regression of
     the slopes on them, whatever the estimator does with spots that are faint or at the edges of windows.
 
     Parameters

@@ -82,7 +82,7 @@ def test_the_fallback_of_modes_is_the_recorded_integrator() -> None:
     assert "fallback" not in control.summary()
 
 
-def test_files(tip_tilt: PredictiveControl, tmp_path: Path) -> None:
+def test_controller_from_a_file_does_the_same(tip_tilt: PredictiveControl, tmp_path: Path) -> None:
     """The controller that is read does the same; so do the exported matrices, without the guard."""
     rows = np.random.default_rng(9).standard_normal((200, 2))
     tip_tilt.save(tmp_path / "controller.npz")

@@ -119,7 +119,9 @@ def test_a_dead_sub_aperture_costs_little(recording: Recording, control: Predict
 
 
 @pytest.mark.slow
-def test_exported_matrices(control: PredictiveControl, recording: Recording, tmp_path: Path) -> None:
+def test_exported_matrices_give_the_same_commands(
+    control: PredictiveControl, recording: Recording, tmp_path: Path
+) -> None:
     """In the unit and with the sign of the recording, within 1e-6 of the largest command."""
     control.export(tmp_path / "controller.npz")
     file = dict(np.load(tmp_path / "controller.npz"))

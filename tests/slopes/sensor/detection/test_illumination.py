@@ -213,7 +213,7 @@ def test_region_of_interest() -> None:
         ("pitch_px = 40: expected at most 31.25", {"pitch_px": 40}),
     ],
 )
-def test_bad_options(words: str, options: dict[str, Any]) -> None:
+def test_illumination_refuses_wrong_options(words: str, options: dict[str, Any]) -> None:
     with refused(words):
         find_lenslets(np.eye(50, 60), **options)
 

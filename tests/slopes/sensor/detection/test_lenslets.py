@@ -213,7 +213,7 @@ def test_no_lattice_is_an_error_in_one_line(image: NDArray[Any]) -> None:
         (np.eye(40), {"bad_pixels": np.ones((40, 40), dtype=bool)}, "bad_pixels"),
     ],
 )
-def test_bad_input(frame: Any, options: dict[str, Any], name: str) -> None:
+def test_lenslets_refuse_wrong_input_in_one_line(frame: Any, options: dict[str, Any], name: str) -> None:
     with pytest.raises(InputError, match=f"^{name}") as caught:
         find_lenslets(frame, **options)
     assert "\n" not in str(caught.value)
@@ -232,7 +232,7 @@ def fits_frame(name: str) -> NDArray[np.float64]:
 
 @pytest.mark.parametrize("binned", [False, True])
 @pytest.mark.parametrize("single", [False, True])
-def test_bench_frames(binned: bool, single: bool) -> None:
+def test_bench_frames_have_64_lenslets(binned: bool, single: bool) -> None:
     frames = bench_frames("data/ciao_bench_60x224x224.npz")
     if binned:
         frames = frames.reshape(60, 112, 2, 112, 2).sum(axis=(2, 4))
@@ -265,7 +265,7 @@ def test_bench_edge_frames() -> None:
         ("f9wfs_20200225-205600", "hexagonal", 35.02, 28.6, 143),
     ],
 )
-def test_telescope_frames(
+def test_telescope_frames_have_their_grid(
     name: str, geometry: str, pitch_px: float, angle_deg: float, illuminated: int
 ) -> None:
     grid = find_lenslets(fits_frame(f"data/{name}.fits.gz"))

@@ -124,7 +124,7 @@ def _observed(ready: Prepared) -> ObservedLoop:
 
 
 def _with_winds(observed: ObservedLoop, start: Identified | None) -> tuple[LoopOfControl, Kalman]:
-    """Learn the filter of winds, for the interaction matrix as it is."""
+    """Learn the filter of winds, for the interaction matrix as given."""
     ready, delay, seen = observed.ready, observed.delay, observed.seen
     loop, site = ready.recording, site_of_loop(ready.recording)
     described = LoopOfControl(

@@ -29,7 +29,7 @@ _OVERSAMPLED, _MARGIN = 4, 2  # nodes a sub-aperture; sub-apertures around the s
 _SMOOTHNESS = 1e-3  # of surfaces of the mirror, which follow slopes to 2e-4 of their power
 _STEPS = np.array([0.05, 0.05, 0.02, 0.02])  # of derivatives
 _MODEL_ERRORS = np.array([0.04, 0.04, math.radians(0.5), 0.02])
-"""Of shifts, rotation and magnification, as the filter is: found in loops with right matrices."""
+"""Errors of shifts, rotation and magnification by the filter's own, found in loops with right matrices."""
 _COLUMN_ERROR, _COLUMN_PRIOR = 0.08, 0.3  # likewise, of the gain of a command; expected scatter of gains
 _SETTLED = 100  # frames
 _MOST_FRAMES = 1000

@@ -233,7 +233,7 @@ class Modes(NamedTuple):
     """Recording in modes of its interaction matrix."""
 
     recording: Recording
-    """Of (frames, k) modes; NaN where a frame has too few slopes."""
+    """Recording of (frames, k) modes; NaN where a frame has too few slopes."""
     analysis: Floats
     """(k, m): matrix from slopes to modes, 0 for slopes never measured; its rows are orthonormal."""
 

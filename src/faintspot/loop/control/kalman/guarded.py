@@ -22,7 +22,7 @@ _LEAST_DEVIATION, _MOST_DEVIATIONS = 0.03, 5.0  # of a difference, and in one fr
 _SETTLING = 15  # frames after a change whose residuals belong to both
 _MEASURED, _MEASURED_MEMORY = 20, 200  # frames of the integrator's residual: fewest, and memory
 _MEASURES = 4
-"""Of the mirror's controller: residual, surprise, slopes that are not used, commands at the limit."""
+"""Measures of the mirror's controller: residual, surprise, unused slopes, commands at the limit."""
 _ALLOWED, MOST_EXCESS, _IN_ONE_FRAME = (1.1, 1.5, 1.3, 1.1), 16.0, (20.0, 5.0, 2.0, 2.0)
 """Measures of the filter in those of the integrator: allowed; sum of the excess; largest that counts."""
 _LEAST = 1e-30, 0.5, 1.0, 1.0  # measures of the integrator

@@ -97,7 +97,7 @@ class Frame(NamedTuple):
     prior_std: Any
     """(m,) or (0,) float64: prior of the estimator; none."""
     noise_factor: float
-    """Of the errors' variances."""
+    """Factor on the errors' variances."""
 
 
 class Recorded(NamedTuple):
