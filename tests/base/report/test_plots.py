@@ -64,7 +64,7 @@ def test_missing_matplotlib_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> 
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     for module in (
         "base.report.plots",
-        "slopes.recorded.layout_picture",
+        "slopes.sensor.drawing",
         "slopes.recorded.pictures",
     ):
         for name in ("faintspot.base.report.plots", f"faintspot.{module}"):

@@ -41,7 +41,7 @@ _KNEES, _POWER = (1e-3, 3e-3, 1e-2, 3e-2), 3.0
 steeply than each, as Zernike tilt does (power 11 / 6) and the mean gradient over a pupil (17 / 6)."""
 _FINE_KNEE, _MOST_MISFIT = 0.2, 1.0
 """Knee of turbulence too fine for the mirror, of which bright sensors see a part; added where spectra do not
-fit: misfit of each frequency."""
+fit: misfit of each frequency. Not of a few modes such as tip and tilt, whose spectra fall less steeply."""
 _STEP, _GAIN_STEPS, _UPDATES = 0.1, 36, 30
 _MOST_CONTRAST = 6.0  # of a frequency with more power than the model: vibrations count no more than that
 _UNSTABLE = 1e4  # by how much more unlikely a gain is with which the recorded loop would not be stable
@@ -94,7 +94,7 @@ class ModalFits:
         self._gains = np.geomspace(GAINS[0], GAINS[1], _GAIN_STEPS)[1:-1]
         self._loop_gain = _gain_of_law(modes, sent, run, 1)
         self._delays = np.arange(1.0, MOST_DELAY + 0.5 * _STEP, _STEP)
-        for knees in _KNEES, (*_KNEES, _FINE_KNEE):
+        for knees in [_KNEES, (*_KNEES, _FINE_KNEE)][: 1 if len(lines) < _FEW_MODES else 2]:
             self._shapes = _shapes(window, lines, knees)
             self._strength: Floats | None = None
             self._all = np.array([self._misfit(delay) for delay in self._delays])
