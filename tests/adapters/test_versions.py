@@ -39,6 +39,7 @@ def test_untested_oopao_version_warns_once(version: str) -> None:
     said_once(lambda: oopao.attach(test_oopao.StandIn(), EVERYTHING), "OOPAO", version, oopao.TESTED)
 
 
+@pytest.mark.slow  # pyRTC starts a process when it is imported
 @needs("pyrtc", "pyrtc")
 def test_untested_pyrtc_version_warns_once(version: str) -> None:
     def make() -> None:

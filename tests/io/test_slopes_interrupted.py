@@ -24,7 +24,7 @@ from pathlib import Path
 sys.path[:0] = sys.argv[2:]
 from faintspot.io.formats import zarr_files
 from tests.io import slope_files as t
-slopes_zarr._CHUNK_NUMBERS = 70
+zarr_files._CHUNK_NUMBERS = 70
 whole = t.result(1000)
 print("ready", flush=True)
 t.write(Path(sys.argv[1]), whole, 3)

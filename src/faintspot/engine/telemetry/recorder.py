@@ -254,6 +254,7 @@ class Recorder:
             if not (something or ended):
                 gone = self._gone()
                 time.sleep(_POLL_S)
+        self._images.read(sys.maxsize)  # those of the last frames, of which many may have come at once
         self._write({"complete": True, "ended_because": ended})
         self._reader.close()
         return self._report(time.monotonic() - start, ended)
