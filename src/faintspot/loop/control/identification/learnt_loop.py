@@ -191,9 +191,8 @@ def _controlling(
     recorded, remarks = ready.loop_gain, list(loop.remarks)
     plain = recorded if math.isfinite(recorded) else advised
     is_off = abs(math.log(max(plain, 1e-9) / advised)) > math.log(_MOST_OFF)
-    if (
-        is_off and not described.analysis.size
-    ):  # of modes, the gain is less certain than that the loop has run
+    has_sure_gain = not described.analysis.size  # of modes it is less certain than that the loop has run
+    if is_off and has_sure_gain:
         plain = advised
         described = replace(described, recorded_gain=max(recorded, 1e-9) * gain)
         remarks.append(f"fallback integrator: gain {advised:.2g}, as the recorded {recorded:.2g} leaves more")

@@ -94,7 +94,8 @@ class ModalFits:
         self._gains = np.geomspace(GAINS[0], GAINS[1], _GAIN_STEPS)[1:-1]
         self._loop_gain = _gain_of_law(modes, sent, run, 1)
         self._delays = np.arange(1.0, MOST_DELAY + 0.5 * _STEP, _STEP)
-        for knees in [_KNEES, (*_KNEES, _FINE_KNEE)][: 1 if len(lines) < _FEW_MODES else 2]:
+        fine = [] if len(lines) < _FEW_MODES else [(*_KNEES, _FINE_KNEE)]
+        for knees in [_KNEES, *fine]:
             self._shapes = _shapes(window, lines, knees)
             self._strength: Floats | None = None
             self._all = np.array([self._misfit(delay) for delay in self._delays])
