@@ -4,8 +4,6 @@ A run prints its tables and writes them, with the machine and the versions, as J
 those of benchmarks that are named also to docs/results/data, from where the documentation takes its figures.
 """
 
-from __future__ import annotations
-
 import importlib
 import importlib.util
 import sys

@@ -12,8 +12,6 @@ read noise, is below 0.1 px. Each measurable spot of which all is in the frame i
 A sub-aperture is false if its lenslet has no flux, or none is near.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

@@ -9,8 +9,6 @@ direction: on a busy machine the ratio of best or the median ratio is easily off
 hardly both, while a change of the code moves both.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace

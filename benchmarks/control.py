@@ -9,8 +9,6 @@ Learning the Kalman filter from telemetry of the 4.2 m telescope: seconds of pro
 again from the turbulence known before, which is then judged on frames not learnt from.
 """
 
-from __future__ import annotations
-
 import resource
 import time
 from functools import partial

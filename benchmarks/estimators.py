@@ -6,8 +6,6 @@ every window's pixels), over what 20 iterations add to the pipeline without deno
 within +-1 px, and in the rows marked "whole window" everywhere.
 """
 
-from __future__ import annotations
-
 from functools import partial
 from typing import Any
 

@@ -6,8 +6,6 @@ move together by 0.02 pitches from frame to frame. A valid slope is wrong if it 
 of the pitch, or if its lenslet has no spot.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from typing import Any
 

@@ -8,8 +8,6 @@ loop. A difference in magnitudes is one of the guide star: the integrator, tuned
 ratio of the other control. The report of the recording is compared with the loop.
 """
 
-from __future__ import annotations
-
 import json
 import sys
 import tempfile

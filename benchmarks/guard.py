@@ -7,8 +7,6 @@ their residuals count from 1 s on. The same with sub-apertures that are dead, st
 with and without an actuator that does not move: there Strehl ratios count.
 """
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Callable
 from dataclasses import replace

@@ -7,8 +7,6 @@ in a run of the loop; pyRTC's least squares (`pip install pyrtcao`) has the opti
 phase in the replay. Filters and rival learn from the same telemetry, and all are scored on other turbulence.
 """
 
-from __future__ import annotations
-
 import importlib.util
 import os
 import time

@@ -12,8 +12,6 @@ quantiles of those frames alone during which it did not happen ("undisturbed"). 
 neighbour on the same physical core takes is in neither count.
 """
 
-from __future__ import annotations
-
 import os
 import resource
 import threading

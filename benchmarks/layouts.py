@@ -16,8 +16,6 @@ at hand. Each gets one verdict:
 `python -m benchmarks.layouts --help` lists the options: another seed, fewer arrays, names of the failures.
 """
 
-from __future__ import annotations
-
 import gzip
 import os
 import sys

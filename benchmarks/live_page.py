@@ -6,8 +6,6 @@ one run of the engine, so that both see the same neighbours. Latencies are those
 from the last row's arrival to the slopes' publication; they are read once at each turn's end.
 """
 
-from __future__ import annotations
-
 import asyncio
 import json
 import os

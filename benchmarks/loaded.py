@@ -4,8 +4,6 @@ Each task runs in a fresh interpreter and a folder of its own, after the command
 processes do not count. `python -m benchmarks.loaded TASK` lists the modules of one task.
 """
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

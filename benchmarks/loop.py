@@ -6,8 +6,6 @@ small structures, but the air stands still for some frames and jumps in others; 
 structures off, the more the farther from the points.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

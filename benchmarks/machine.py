@@ -1,7 +1,5 @@
 """What a machine is, and what runs on it: results of the same fingerprint can be compared."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os

@@ -18,8 +18,6 @@ of them after the other, and by how much it moves tells its standard error (the 
 slow phases last for many turns). compare.py needs it to tell a change from noise.
 """
 
-from __future__ import annotations
-
 import gc
 import math
 import os

@@ -6,8 +6,6 @@ telescope diameter, pixel scale and frame rate. r0 is compared with that of the 
 their structure function over all realisations.
 """
 
-from __future__ import annotations
-
 import cmath
 import json
 import math

@@ -4,8 +4,6 @@ writes the tables of docs/results/paper.md from two folders of `faintspot loop n
 `--unit counts`.
 """
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

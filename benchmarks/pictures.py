@@ -6,8 +6,6 @@ must stay within 1.3. Denoising has nothing to do on constant images (dark, satu
 "tv, accurate" iterates until its images have converged, and takes what it takes.
 """
 
-from __future__ import annotations
-
 from functools import partial
 from typing import Any
 

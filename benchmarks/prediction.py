@@ -7,8 +7,6 @@ integrator's gain is. All are scored on other turbulence; the rivals with bright
 gain in magnitudes shows.
 """
 
-from __future__ import annotations
-
 import importlib.util
 import itertools
 from collections.abc import Callable, Iterator, Mapping, Sequence

@@ -8,8 +8,6 @@ where several sensors' calibration maps do not stay in the cache, these in every
 bandwidth as a plain copy has it. The larger one of both fractions of a processor's time is the limit.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

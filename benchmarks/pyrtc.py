@@ -18,8 +18,6 @@ iterations; its time includes dark, bad and saturated pixels, standard errors an
   frames/s, blocks of frames in turn; the engine is halted (SIGSTOP) while pyRTC has its turn.
 """
 
-from __future__ import annotations
-
 import importlib.util
 import os
 import signal

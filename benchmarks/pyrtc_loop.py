@@ -19,8 +19,6 @@ late.
 The plain centre of gravity makes the same commands as pyRTC's: by how much they differ is said.
 """
 
-from __future__ import annotations
-
 import importlib.util
 import os
 import shutil

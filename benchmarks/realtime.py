@@ -13,8 +13,6 @@ The limit of iterations is tried on frames that converge slowly: strength near t
 From the last row to the command: see frame_to_command.py.
 """
 
-from __future__ import annotations
-
 import time
 from typing import Any
 from uuid import uuid4

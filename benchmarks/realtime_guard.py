@@ -4,8 +4,6 @@ The engine's loop with a fixed window behind the simulated telescope, integrator
 clock. After 200 frames something happens; a loop that has not opened within 300 more counts as closed.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 

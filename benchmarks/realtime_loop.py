@@ -9,8 +9,6 @@ so that a busy machine holds it and commands act after the delay that is set (ho
 are as much slower, so that the loop is as late as at 250 frames/s. Two processors at least should be free.
 """
 
-from __future__ import annotations
-
 import subprocess
 import tempfile
 import time

@@ -1,7 +1,5 @@
 """An engine and a simulated camera or telescope as processes of their own, and what they say of a run."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 import tempfile

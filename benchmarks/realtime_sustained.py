@@ -12,8 +12,6 @@ the engine's. FAINTSPOT_SUSTAINED_HZ is its frame rate (500).
 FAINTSPOT_SUSTAINED_S sets how long each of the other runs takes, by default 300 s.
 """
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Simulated loops of various seeds, turbulence, flux, gain and delay, as recordings with their truth."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 from typing import Any

@@ -6,8 +6,6 @@ recording (telemetry/keck_tt of the public repository aditya-sengupta/tip-tilt-c
 keck_tt of FAINTSPOT_SHARED.
 """
 
-from __future__ import annotations
-
 import importlib.util
 import os
 from functools import partial

@@ -5,8 +5,6 @@ more, up to 1.5 pitches away, with another offset, another flux, or in a frame c
 lenslets' own errors. The commands of docs/guide/wavefront.md give the difference.
 """
 
-from __future__ import annotations
-
 import io
 import json
 import tempfile

@@ -1,7 +1,5 @@
 """What a run found, as a JSON file: written after every benchmark, so that an interrupted run keeps it."""
 
-from __future__ import annotations
-
 import json
 import math
 import re

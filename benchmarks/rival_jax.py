@@ -5,8 +5,6 @@ and masked rolling are equal; `top_k` beats sorting slightly; blocks of 64 to 12
 beat all images at once by 1.5.
 """
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable
 from typing import Any

@@ -1,7 +1,5 @@
 """The same algorithm in NumPy, as fast as NumPy goes: many images at once, float32, no temporaries."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

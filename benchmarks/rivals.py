@@ -14,8 +14,6 @@ handed the stack of images, ready made.
 Optional packages that are not installed are named below the table.
 """
 
-from __future__ import annotations
-
 import importlib.util
 import time
 from collections.abc import Callable

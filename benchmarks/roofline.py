@@ -24,8 +24,6 @@ Everything is run in turns on one processor; the clock is measured in the same t
 dependent integer additions, one cycle each. x86-64 only: the replay is written in its assembly.
 """
 
-from __future__ import annotations
-
 import ctypes
 import platform
 import random

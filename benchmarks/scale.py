@@ -9,8 +9,6 @@ sub-apertures are not shared between threads, because waking one costs more than
 processors do as one does.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

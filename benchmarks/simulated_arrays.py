@@ -1,7 +1,5 @@
 """Random Shack-Hartmann frames with a known layout, for `benchmarks.layouts`."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

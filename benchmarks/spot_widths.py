@@ -7,8 +7,6 @@ spot over the displacements, which a reference takes off. The settings are tried
 Moffat spots have other wings.
 """
 
-from __future__ import annotations
-
 import contextlib
 import io
 import re

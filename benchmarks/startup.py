@@ -5,8 +5,6 @@ is subtracted. The best sample is given: interference only adds. Without compile
 sample.
 """
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

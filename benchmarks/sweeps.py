@@ -1,7 +1,5 @@
 """The denoiser's sweep on its own, many times in one call."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

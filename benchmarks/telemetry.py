@@ -5,8 +5,6 @@ given. Random loops have HCIPy's turbulence or a vibration. Those of one flux ar
 turbulence with another gain and with the predictive filter, which shows what these really leave.
 """
 
-from __future__ import annotations
-
 import cmath
 import math
 from collections.abc import Iterable

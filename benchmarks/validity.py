@@ -6,8 +6,6 @@ than 0.3 px: at low flux, errors of 0.3 px are noise that the errors state. A lo
 would be. Left out: frames in which all spots are beyond their windows, which no neighbour contradicts.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

@@ -5,8 +5,6 @@ pokes of 44 Zernike modes, which its `inverse_tikhonov` inverts. faintspot gets 
 slopes, and the angle of a pixel from a tilt. Wavefronts are compared at the centres of the lit lenslets.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import hcipy

@@ -4,8 +4,6 @@ Winds, strengths, outer scale, noise and vibrations are learnt from telemetry of
 on other turbulence. In winds that drift, the filter is learnt again and handed over as beside an engine.
 """
 
-from __future__ import annotations
-
 from functools import partial
 from typing import NamedTuple, cast
 

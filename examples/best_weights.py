@@ -8,8 +8,6 @@ per axis after the gain is taken off; standard errors by blocks of spots, paired
     python examples/best_weights.py [--motion 0.5] [--spots 20000]
 """
 
-from __future__ import annotations
-
 import argparse
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The shortest use from Python, on simulated frames; draws what every step does."""
 
-from __future__ import annotations
-
 import sys
 
 import numpy as np

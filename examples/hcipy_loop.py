@@ -6,8 +6,6 @@ interaction matrix of its own without noise, and the loop gain and numbers of it
 pixels, strength) that served it best on other air than it is then judged by.
 """
 
-from __future__ import annotations
-
 from contextlib import nullcontext
 from functools import cache
 from typing import Any

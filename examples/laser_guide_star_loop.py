@@ -7,8 +7,6 @@ the same turbulence and noise. Window widths are chosen in other turbulence than
     python examples/laser_guide_star_loop.py
 """
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Callable
 from typing import Any

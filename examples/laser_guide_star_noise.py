@@ -9,8 +9,6 @@ filters have the noise of the Cramer-Rao bound. Errors: standard error over wave
     python examples/laser_guide_star_noise.py
 """
 
-from __future__ import annotations
-
 import argparse
 from dataclasses import replace
 from typing import Any, NamedTuple

@@ -8,8 +8,6 @@ methods know the profile.
     python examples/laser_guide_stars.py
 """
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Callable, Iterator
 from dataclasses import replace

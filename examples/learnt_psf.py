@@ -12,8 +12,6 @@ bright frames, and for the last three the actual over the stated standard error.
     python examples/learnt_psf.py bench.npz --gain-e-per-adu 2.1
 """
 
-from __future__ import annotations
-
 import argparse
 from typing import Any
 

@@ -1,7 +1,5 @@
 """What the examples with other tools share: every method is tuned on other air than it is judged by."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any

@@ -7,8 +7,6 @@ each pixel, and of the ratio of slope errors to standard errors. Errors: jackkni
     python examples/noise_maps.py
 """
 
-from __future__ import annotations
-
 import argparse
 from dataclasses import replace
 from typing import Any, NamedTuple

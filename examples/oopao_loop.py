@@ -5,8 +5,6 @@ of read noise. One line makes a sensor measure with faintspot (`attach`); OOPAO'
 interaction matrix are then made through it. Every method is tuned on other air than it is judged by.
 """
 
-from __future__ import annotations
-
 import contextlib
 import io
 from functools import cache

@@ -8,8 +8,6 @@ spots stand off the centres by a fixed tilt plus what the loop commands. The loo
 tilt, brings them back. With a file name (.npz) as argument, frames and slopes go there.
 """
 
-from __future__ import annotations
-
 import subprocess
 import sys
 import tempfile

@@ -9,8 +9,6 @@ slopes.class_name=pyrtc.SlopesProcess is pyRTC's own centroiding. Needs `pip ins
 `realtime`, for the telescope `loop` as well.
 """
 
-from __future__ import annotations
-
 import subprocess
 import sys
 import time

@@ -7,8 +7,6 @@ method has an interaction matrix of its own and is tuned on other air than it is
 the part of the air's displacements of the spots that is taken off.
 """
 
-from __future__ import annotations
-
 import contextlib
 import logging
 from functools import cache

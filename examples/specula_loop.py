@@ -6,8 +6,6 @@ where it is); in the file that calibrates, it says `calibrating`. Every method h
 and is tuned on other air than it is judged by.
 """
 
-from __future__ import annotations
-
 import logging
 import tempfile
 from pathlib import Path

@@ -11,8 +11,6 @@ frames and scored on the other.
     python examples/thinned_spots.py bench.npz --gain-e-per-adu 2.1
 """
 
-from __future__ import annotations
-
 import argparse
 from typing import Any
 

@@ -10,8 +10,6 @@ another. Standard errors: jackknife over frames, or over sequences of frames.
     python examples/tv_variants.py --realisations 1960
 """
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Callable
 from itertools import product

@@ -1,7 +1,5 @@
 """Interface of a loop that another package simulates, and the integrator."""
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Loop of HCIPy: its example's telescope, sensor and mirror behind three of its infinite layers."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Differences of Strehl ratios as magnitudes of the guide star."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

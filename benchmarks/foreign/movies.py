@@ -1,7 +1,5 @@
 """Open-loop movies of spots that other packages make, without noise, and the truth of their turbulence."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Loops of OOPAO: atmosphere, telescope, sensor, noise and mirror are OOPAO's, slopes by `window`."""
 
-from __future__ import annotations
-
 import contextlib
 import io
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """What `faintspot telemetry` says of the recording that the filter learns from, beside the loop."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

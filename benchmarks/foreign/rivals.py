@@ -1,7 +1,5 @@
 """pyRTC's modal predictors on the slopes of any loop, with the matrix as calibrated or its gain corrected."""
 
-from __future__ import annotations
-
 import importlib.util
 import itertools
 from collections import deque

@@ -1,7 +1,5 @@
 """Rows of the table: loops of OOPAO, SPECULA, HCIPy and soapy."""
 
-from __future__ import annotations
-
 import importlib.util
 from collections.abc import Callable
 from dataclasses import dataclass, replace

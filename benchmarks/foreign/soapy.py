@@ -1,7 +1,5 @@
 """Loop of soapy: 4.2 m, 7 x 7 lenslets behind three of its infinite screens, slopes by `window`."""
 
-from __future__ import annotations
-
 import contextlib
 import io
 import sys

@@ -1,7 +1,5 @@
 """Loop of SPECULA: 27 Zernike modes of 6 x 6 lenslets in three layers, from the example's parameter file."""
 
-from __future__ import annotations
-
 import importlib
 import sys
 from pathlib import Path

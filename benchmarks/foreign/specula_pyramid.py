@@ -1,7 +1,5 @@
 """Loops of SPECULA with its modulated pyramid, of which faintspot is told no geometry."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 from typing import Any

@@ -7,6 +7,4 @@ over the flux used. Times: all in turns, on one processor. BM3D is for non-comme
 install it yourself.
 """
 
-from __future__ import annotations
-
 from benchmarks.yardstick.judge import run as run

@@ -1,7 +1,5 @@
 """Candidates: this package's estimators, and denoisers of others, each with the settings to choose from."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import lru_cache, partial

@@ -1,7 +1,5 @@
 """Choose each candidate's settings on training spots, score it on others, and time it."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from functools import partial
 from importlib.util import find_spec

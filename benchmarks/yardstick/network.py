@@ -1,7 +1,5 @@
 """A small convolutional network in JAX. It gives two maps: the denoised image, and weights of a centroid."""
 
-from __future__ import annotations
-
 import time
 from dataclasses import dataclass
 from typing import Any

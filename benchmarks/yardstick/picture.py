@@ -1,7 +1,5 @@
 """Picture of the stored table: `python -m benchmarks.yardstick.picture docs/results/data/yardstick.json`."""
 
-from __future__ import annotations
-
 import json
 import sys
 from pathlib import Path

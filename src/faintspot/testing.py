@@ -9,8 +9,6 @@
 Needs pytest.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Any control in SPECULA, with a record of slopes and commands."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

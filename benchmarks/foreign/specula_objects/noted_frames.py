@@ -1,7 +1,5 @@
 """Pixels and wavefront of every frame in SPECULA."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

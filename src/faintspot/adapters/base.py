@@ -1,7 +1,5 @@
 """Common parts of the adapters: layouts from a tool's lenslets, slopes in its unit, checks of its input."""
 
-from __future__ import annotations
-
 import functools
 import importlib.metadata
 import re

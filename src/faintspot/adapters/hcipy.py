@@ -1,7 +1,5 @@
 """The slope pipeline as an estimator of HCIPy (Por et al. 2018, Proc. SPIE 10703, 1070342)."""
 
-from __future__ import annotations
-
 from typing import Any, Unpack
 
 import numpy as np

@@ -9,8 +9,6 @@
 The classes are created on first access, which imports pyRTC.
 """
 
-from __future__ import annotations
-
 import functools
 import logging
 from collections.abc import Mapping

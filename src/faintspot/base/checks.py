@@ -1,7 +1,5 @@
 """Input checks on entry to every public function and on reading every file; independent random generators."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any, TypedDict, TypeVar, Unpack
 

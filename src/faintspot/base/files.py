@@ -1,7 +1,5 @@
 """Files: size limits, atomic writes that leave nothing incomplete, checked .npz files, objects that close."""
 
-from __future__ import annotations
-
 import contextlib
 import csv
 import errno

@@ -1,7 +1,5 @@
 """Quantities and flags known of every frame and sub-aperture, and the line that names slopes left out."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from enum import IntFlag

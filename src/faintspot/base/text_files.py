@@ -1,7 +1,5 @@
 """TOML and JSON texts: read with one-line errors and suggestions for unknown names; JSON without NaN."""
 
-from __future__ import annotations
-
 import difflib
 import json
 import math

@@ -1,7 +1,5 @@
 """The command line: thin modules, of one command or a few that belong together."""
 
-from __future__ import annotations
-
 import logging
 import os
 import platform

@@ -1,7 +1,5 @@
 """Commands and options that look alike everywhere, and what commands need before work begins."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager

@@ -1,7 +1,5 @@
 """faintspot layout: find the sub-apertures in a frame."""
 
-from __future__ import annotations
-
 import shlex
 import warnings
 from collections.abc import Iterator, Mapping

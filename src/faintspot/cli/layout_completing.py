@@ -1,7 +1,5 @@
 """Stated arrays, and calibrations completed by what frames show: illumination, background, hot pixels."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Options of faintspot layout, and what it found, in words."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import replace

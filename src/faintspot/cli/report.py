@@ -1,7 +1,5 @@
 """faintspot report and export: a page of pictures and tables, and telemetry for other software."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import click

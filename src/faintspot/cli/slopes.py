@@ -1,7 +1,5 @@
 """faintspot slopes: recorded frames in, slopes out."""
 
-from __future__ import annotations
-
 import shlex
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """faintspot sodium: the profile of a laser guide star's light from recorded frames."""
 
-from __future__ import annotations
-
 import shlex
 from pathlib import Path
 

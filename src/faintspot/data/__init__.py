@@ -1,7 +1,5 @@
 """Example frame of a real sensor, shipped with the package."""
 
-from __future__ import annotations
-
 from importlib.resources import files
 
 import numpy as np

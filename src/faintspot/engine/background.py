@@ -1,7 +1,5 @@
 """Processes of lowest priority beside a running engine: learning from its telemetry."""
 
-from __future__ import annotations
-
 import signal
 import tempfile
 import threading

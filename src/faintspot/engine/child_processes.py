@@ -1,7 +1,5 @@
 """Child processes that end with this one, even if it is killed, and scheduling of the engine (Linux)."""
 
-from __future__ import annotations
-
 import ctypes
 import gc
 import os

@@ -1,7 +1,5 @@
 """User-defined estimators in a running engine: loading a file, its trial, unloading, falling back."""
 
-from __future__ import annotations
-
 import contextlib
 import gc
 import hashlib

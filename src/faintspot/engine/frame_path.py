@@ -4,8 +4,6 @@ A frame path belongs to one pipeline, i.e. to one state of the settings. When se
 prepared while the engine runs, and taken between two frames.
 """
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Guard of a closed loop, which detects when it must be opened, and controllers that take over."""
 
-from __future__ import annotations
-
 import math
 from typing import Any, NamedTuple, Self
 

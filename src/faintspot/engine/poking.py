@@ -1,7 +1,5 @@
 """Poke a mirror through its command stream while an engine measures."""
 
-from __future__ import annotations
-
 import time
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Frame path for an estimator in NumPy, which is tried first and cannot stall the engine."""
 
-from __future__ import annotations
-
 import contextlib
 import ctypes
 import math

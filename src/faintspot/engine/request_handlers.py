@@ -1,7 +1,5 @@
 """Commands of a running engine's control channel."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Mapping
 from dataclasses import replace

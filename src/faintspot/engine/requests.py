@@ -4,8 +4,6 @@ A connection carries one request, a line of JSON {"command": NAME, ...}, and its
 {"ok": false, "error": "one line"}.
 """
 
-from __future__ import annotations
-
 import contextlib
 import fcntl
 import os

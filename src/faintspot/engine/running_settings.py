@@ -1,7 +1,5 @@
 """Settings that change while the engine runs: checked and prepared meanwhile, applied between two frames."""
 
-from __future__ import annotations
-
 import copy
 import math
 import threading

@@ -13,8 +13,6 @@ A segment gets its name when it is complete. Nothing is locked: see `faintspot.e
 `faintspot.engine.telemetry.ring` for the order in which items and cells are written.
 """
 
-from __future__ import annotations
-
 import fcntl
 import mmap
 import os

@@ -1,7 +1,5 @@
 """Statistics of a running engine: latencies, counters, and why a frame was late or lost."""
 
-from __future__ import annotations
-
 import math
 import resource
 from array import array

@@ -1,7 +1,5 @@
 """Threads that measure parts of a frame in compiled code, without the GIL, and predicted slopes as priors."""
 
-from __future__ import annotations
-
 import math
 import os
 import threading

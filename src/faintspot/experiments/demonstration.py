@@ -3,8 +3,6 @@
 7 x 7 sub-apertures of which 36 are lit, 16 x 16 pixels each, an EMCCD at high gain.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any

@@ -3,8 +3,6 @@
 Work on this machine opens no network port.
 """
 
-from __future__ import annotations
-
 import os
 import platform
 import signal

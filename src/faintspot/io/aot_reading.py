@@ -4,8 +4,6 @@ Where the standard is not specific, faintspot's conventions apply: rows of an im
 positions are counted from 0, slopes are in px from the centre of a sub-aperture's window.
 """
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

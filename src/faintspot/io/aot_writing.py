@@ -5,8 +5,6 @@ slopes, fluxes, frames and times. It has none for the noise of slopes, which has
 for flags, iterations, the interleaved configurations and denoised images: these stay in the Zarr store.
 """
 
-from __future__ import annotations
-
 import warnings
 from datetime import UTC, datetime
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Interface of a file format, and contents of a file of slopes with what all writers share."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Input of frames, in blocks of bounded memory; formats of files: subclasses of `FileFormat` in `formats`."""
 
-from __future__ import annotations
-
 import math
 import warnings
 from bisect import bisect_right

@@ -1,7 +1,5 @@
 """Telemetry in a layout of observatories and benches, or in arrays that are named one by one."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace

@@ -5,8 +5,6 @@ As https://github.com/oguyon/milk-streamtelemetry-scan describes (TelemetryForma
 beginning, the times of logging and of acquisition in seconds, and two counters.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping
 from pathlib import Path

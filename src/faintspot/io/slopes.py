@@ -1,7 +1,5 @@
 """Output of slopes, in a format that follows the file name, by a writer that resumes; and reading them."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Writer of slopes: chunk by chunk into a Zarr store with marks of progress, or from memory."""
 
-from __future__ import annotations
-
 import contextlib
 import errno
 import os

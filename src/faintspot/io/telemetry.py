@@ -1,7 +1,5 @@
 """Recorded telemetry, read from its store also while the engine runs; frame numbers left out."""
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager

@@ -1,7 +1,5 @@
 """Zarr stores on the disk, and sizes of compressed chunks, found before a library makes room for them."""
 
-from __future__ import annotations
-
 import bz2
 import itertools
 import lzma

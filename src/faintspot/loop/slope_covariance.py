@@ -11,8 +11,6 @@ axes that are exchanged, it could cancel little more than random slopes would. N
 recording's length matters.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

@@ -5,8 +5,6 @@ outer scale, high ones on the centroid gain and on the averaging within a sub-ap
 each degree by its errors. Tip and tilt, which vibrations change, are left out.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

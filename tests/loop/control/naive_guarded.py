@@ -1,7 +1,5 @@
 """Slow, obvious form of the guarded filter, which compiled ones must equal."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Spots that leave their windows keep their identity, and those that do not are flagged."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Recordings whose spots leave their windows: command, resuming, report, wavefront."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

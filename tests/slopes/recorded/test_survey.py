@@ -1,7 +1,5 @@
 """First look at recorded frames."""
 
-from __future__ import annotations
-
 from functools import cache
 from pathlib import Path
 

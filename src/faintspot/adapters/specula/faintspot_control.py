@@ -1,7 +1,5 @@
 """Predictive control in SPECULA, in place of its reconstructor and integrator."""
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Callable
 

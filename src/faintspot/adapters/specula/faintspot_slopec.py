@@ -1,7 +1,5 @@
 """SPECULA's slope computer with faintspot's slope pipeline."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

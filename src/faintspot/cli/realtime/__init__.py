@@ -1,7 +1,5 @@
 """faintspot realtime: the engine, where its frames come from, and talking to a running one."""
 
-from __future__ import annotations
-
 from functools import cache
 from importlib import import_module
 

@@ -1,7 +1,5 @@
 """faintspot realtime calibrate and learn: the mirror measured by pokes, control learnt from a recording."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Requests that a client may make, and their answers."""
 
-from __future__ import annotations
-
 import hmac
 import ipaddress
 import re

@@ -1,7 +1,5 @@
 """Data of a running engine, read from shared memory."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections.abc import Mapping

@@ -1,7 +1,5 @@
 """The page's updates, sent as binary messages ten times a second, and the engine's status."""
 
-from __future__ import annotations
-
 import asyncio
 import struct
 import threading

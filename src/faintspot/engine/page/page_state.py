@@ -1,7 +1,5 @@
 """Data that the page shows: the newest frame, and a few numbers of each frame of the last minute."""
 
-from __future__ import annotations
-
 from collections import defaultdict, deque
 from collections.abc import Mapping
 from dataclasses import dataclass, field

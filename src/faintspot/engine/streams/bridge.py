@@ -6,8 +6,6 @@ While frames come, the bridge polls the stream's counter and notices a new frame
 `SPINNING_NEEDS` processors it always sleeps, because polling would displace the engine or the camera.
 """
 
-from __future__ import annotations
-
 import contextlib
 import math
 import os

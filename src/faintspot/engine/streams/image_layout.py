@@ -4,8 +4,6 @@ Offsets and sizes hold for 64-bit Linux and follow the public header of version 
 consists of metadata, values, keywords and the signals between readers and writers.
 """
 
-from __future__ import annotations
-
 import ctypes
 import math
 import os

@@ -1,7 +1,5 @@
 """Streams of ImageStreamIO (milk, cacao) in shared memory: frames in, slopes and commands out."""
 
-from __future__ import annotations
-
 import contextlib
 import math
 import mmap

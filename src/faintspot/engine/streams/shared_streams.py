@@ -6,8 +6,6 @@ including programs that do not use faintspot. So its place is kept, but it must 
 closed to others.
 """
 
-from __future__ import annotations
-
 import ctypes.util
 import errno
 import fcntl

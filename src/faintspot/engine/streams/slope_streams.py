@@ -1,7 +1,5 @@
 """Slopes and commands out, predictions in: pyshmem streams, for pyRTC and, by a bridge, ImageStreamIO."""
 
-from __future__ import annotations
-
 import contextlib
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager

@@ -1,7 +1,5 @@
 """Streams that other programs publish: pyshmem's NAME and ImageStreamIO's isio:NAME."""
 
-from __future__ import annotations
-
 import math
 import threading
 import time

@@ -1,7 +1,5 @@
 """Numbers of a recording: rates, latencies, lost frames, and methods that alternated."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

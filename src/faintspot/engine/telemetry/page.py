@@ -1,7 +1,5 @@
 """The report page of telemetry that was recorded of a running engine."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 

@@ -4,8 +4,6 @@ The engine is independent of it: a recorder that is too slow, or whose disk is f
 nothing.
 """
 
-from __future__ import annotations
-
 import sys
 import time
 from collections.abc import Callable, Mapping

@@ -1,7 +1,5 @@
 """Strehl ratio against the star's flux, for any list of methods, each tuned at every flux."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Search for the settings of a closed loop, from the best of a coarse grid."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Mapping, Sequence

@@ -1,7 +1,5 @@
 """Tables, sentences and the report page of closed-loop results."""
 
-from __future__ import annotations
-
 import textwrap
 import tomllib
 

@@ -5,8 +5,6 @@ both are found by restricted maximum likelihood (Patterson & Thompson 1971, Biom
 those of leaving out one cycle at a time, which assumes nothing of the scatter of single methods.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Differences between methods that alternated, with errors, and the hours that would show them."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

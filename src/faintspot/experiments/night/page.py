@@ -1,7 +1,5 @@
 """The page, the JSON summary and the Zarr store of a night."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace

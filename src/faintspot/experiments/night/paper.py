@@ -1,7 +1,5 @@
 """Table 1 of Basden et al. 2015 beside a night of the same protocol, and how much its differences prove."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Protocol of alternating observations, and a night: one row for each block of frames of one method."""
 
-from __future__ import annotations
-
 import math
 import shutil
 from dataclasses import dataclass, fields, replace

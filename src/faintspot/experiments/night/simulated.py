@@ -1,7 +1,5 @@
 """The night in a simulated loop: alternating methods, and the reference alone in the same turbulence."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import asdict
 from pathlib import Path

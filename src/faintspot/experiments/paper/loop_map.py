@@ -1,7 +1,5 @@
 """Map of closed-loop gains by denoising: methods over flux, read noise and turbulence."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The planner's answer: what to use, how good everything else is, and what this rests on."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, field, replace
 from pathlib import Path

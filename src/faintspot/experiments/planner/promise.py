@@ -1,7 +1,5 @@
 """Check of promised slope errors on recorded frames that were not used to learn them."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """Camera and optics that a user states, as options."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import Any

@@ -1,7 +1,5 @@
 """Choose the settings of every method on one sample of spots, score them on another, and recommend one."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass

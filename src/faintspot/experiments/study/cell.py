@@ -4,8 +4,6 @@ All methods see the same images. They are simulated and measured block by block,
 with the number of realisations.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 

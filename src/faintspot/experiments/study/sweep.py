@@ -1,7 +1,5 @@
 """Cells of a study, each one set of physical parameters, and sweeps, which list them."""
 
-from __future__ import annotations
-
 import hashlib
 import itertools
 import math

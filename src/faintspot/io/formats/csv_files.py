@@ -1,7 +1,5 @@
 """Text files: slopes in .csv, a line for each frame and sub-aperture; arrays in .csv, .txt and .dat."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import IO
 

@@ -4,8 +4,6 @@ Values follow the FITS standard 4.0, section 4.4.2: physical = BZERO + BSCALE * 
 integers without a value, which become NaN.
 """
 
-from __future__ import annotations
-
 import gzip
 import warnings
 from collections.abc import Mapping

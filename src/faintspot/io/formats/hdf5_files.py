@@ -1,7 +1,5 @@
 """Frames in HDF5 and MATLAB files, and arrays that IDL's SAVE wrote (.sav)."""
 
-from __future__ import annotations
-
 import struct
 import zlib
 from contextlib import ExitStack

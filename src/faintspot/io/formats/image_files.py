@@ -1,7 +1,5 @@
 """Frames in image files: PNG, BMP and JPEG, one per file; TIFF pages and stacks of cameras and ImageJ."""
 
-from __future__ import annotations
-
 import importlib.util
 import logging
 import math

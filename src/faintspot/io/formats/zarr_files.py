@@ -5,8 +5,6 @@ chunks are on the disk, the mark `finished_frames` in the group's attributes is 
 ends, the store is valid and the mark counts complete frames only.
 """
 
-from __future__ import annotations
-
 import shutil
 import warnings
 from collections.abc import Mapping

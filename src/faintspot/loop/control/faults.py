@@ -5,8 +5,6 @@ Their noise would look small, so that a filter would trust them most of all. The
 grow.
 """
 
-from __future__ import annotations
-
 import itertools
 import math
 from functools import partial

@@ -1,7 +1,5 @@
 """Command that would flatten a measured wavefront."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 

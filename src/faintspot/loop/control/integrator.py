@@ -1,7 +1,5 @@
 """Integrators, one of them compiled, and the product of a matrix with slopes while rows arrive."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial

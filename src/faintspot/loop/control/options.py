@@ -1,7 +1,5 @@
 """Options of the table [control] of faintspot.toml, and modes that are removed from slopes."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import partial
 

@@ -1,7 +1,5 @@
 """Reconstruction of commands from slopes and their noise."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

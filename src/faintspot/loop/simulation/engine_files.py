@@ -1,7 +1,5 @@
 """Files with which a real-time engine controls a simulated telescope."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Sensor of a laser guide star, the low orders from a natural star, and knowledge of the sodium layer."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace

@@ -1,7 +1,5 @@
 """Sections of the configuration of a loop: telescope, sensor, atmosphere, camera, laser, control, run."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, field
 

@@ -1,7 +1,5 @@
 """Pupil, mirrors, and Shack-Hartmann sensor: flux on the camera from the wavefront."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from functools import cached_property

@@ -5,8 +5,6 @@ subtracted from the residual phase, is the deviation of the turn's pseudo-open-l
 time.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Page of a recorded loop: pictures and tables with errors."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Recorded loop of any system, read from its file."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import replace

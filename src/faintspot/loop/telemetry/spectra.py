@@ -1,7 +1,5 @@
 """Spectra of open-loop slopes and of the fitted turbulence, noise and vibrations."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Dark level and noise of each pixel, from dark frames, and the pixels that blink or are hot."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from functools import cache

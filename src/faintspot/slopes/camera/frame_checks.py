@@ -1,7 +1,5 @@
 """Checks of frames: colour mosaics, saturation, bytes in the wrong order, hot pixels."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

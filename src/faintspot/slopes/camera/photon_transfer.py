@@ -1,7 +1,5 @@
 """Read noise and gain of a camera, from dark frames and from frames with constant flux."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import Any, NamedTuple

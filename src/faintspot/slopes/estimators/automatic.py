@@ -17,8 +17,6 @@ noise outside the core. If the spot is lost in the noise (small C), the result i
 the centre of the window; if the noise exceeds the range of positions, the image is not denoised.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple, Required, TypedDict, Unpack
 
 import numpy as np

@@ -3,8 +3,6 @@
 Symbols are those of faintspot.slopes.estimators.automatic.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """Brightest pixels and centre of gravity."""
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 import numpy as np

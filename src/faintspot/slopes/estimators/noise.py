@@ -1,7 +1,5 @@
 """Noise of the pixels, and the denoising strength suggested by it."""
 
-from __future__ import annotations
-
 from typing import Any, Literal, NamedTuple, TypedDict, Unpack, overload
 
 import numpy as np

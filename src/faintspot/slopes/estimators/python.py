@@ -1,7 +1,5 @@
 """Estimators in plain NumPy: the compiled kernel calibrates the images, Python finds the positions."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Callable
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Sensor for which an estimator is prepared, and the scene from which its options are chosen."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from functools import cached_property

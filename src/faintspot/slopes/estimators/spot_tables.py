@@ -1,7 +1,5 @@
 """Tables of the estimators that know the spot, in the form that kernels read."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Brightest-pixel background subtraction, centre of gravity and smoothing of W images, one in each lane."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

@@ -5,8 +5,6 @@ took half of the time of compiling a pipeline. Here a kernel is optimised and be
 Python calls it, together with all that it calls; what other kernels call is only a part of them.
 """
 
-from __future__ import annotations
-
 import hashlib
 import logging
 import warnings

@@ -4,8 +4,6 @@ The flux of a window is the largest sum over a box of pixels above the window's 
 the noise that the borders of windows show in the same frame, so that neither gain nor dark level is needed.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Any, NamedTuple
 

@@ -8,8 +8,6 @@ References: Chambolle 2004 (J. Math. Imaging Vis. 20, 89), Beck & Teboulle 2009 
 18, 2419).
 """
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Flags of spots that are probably wrong: cut by the window edge, or unlike all their neighbours."""
 
-from __future__ import annotations
-
 import math
 from typing import Any, NamedTuple
 

@@ -1,7 +1,5 @@
 """Estimators that know the spot: the own kernels of weighted, fitted and posterior estimators."""
 
-from __future__ import annotations
-
 import math
 from typing import Any, NamedTuple
 

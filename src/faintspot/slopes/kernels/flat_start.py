@@ -9,8 +9,6 @@ obey the constraint.
 The Laplace equation, with Neumann edges, is solved by cosine transforms along x and elimination along y.
 """
 
-from __future__ import annotations
-
 import math
 from functools import cache
 from typing import Any

@@ -1,7 +1,5 @@
 """Between frames or stacks of images and groups of W sub-apertures with all lanes of a pixel side by side."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Centres of gravity of the brightest pixels, after denoising or smoothing; their steps on stacks."""
 
-from __future__ import annotations
-
 import math
 from typing import Any, NamedTuple
 

@@ -5,8 +5,6 @@ what was found. Every function here works on the groups [start, stop), so that t
 results do not depend on how they do.
 """
 
-from __future__ import annotations
-
 import math
 from functools import cache
 from types import FunctionType

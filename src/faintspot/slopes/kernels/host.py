@@ -1,7 +1,5 @@
 """Capabilities of the processor: vector width, aligned scratch memory, and subnormals counted as 0."""
 
-from __future__ import annotations
-
 import os
 from functools import cache
 from typing import Any

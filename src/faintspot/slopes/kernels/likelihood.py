@@ -6,8 +6,6 @@ The score is sum w (g - m) dm, the information I = sum w dm dm', the covariance 
 J = sum w^2 (VARIANCE + EXCESS m) dm dm', and that of the estimate I^-1 J I^-1, whatever the weights.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Positions that are means: under a weight that follows the spot, and over the posterior on a grid."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

@@ -8,8 +8,6 @@ These are LLVM's atomic operations (release, acquire, and a fence of both). On x
 by itself, they are plain moves, and the fence is nothing; on aarch64, which does not, stlr, ldar and dmb.
 """
 
-from __future__ import annotations
-
 import time
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Sharing the groups of a job among threads, each with scratch memory of its own."""
 
-from __future__ import annotations
-
 import os
 import threading
 from collections.abc import Callable

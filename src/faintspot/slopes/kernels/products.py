@@ -1,7 +1,5 @@
 """Products of a matrix with vectors and with slopes while rows arrive, and rows of telemetry."""
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Per-lane rows (n_rows, W) of estimators of a spot's position; profiles and model image of the spot."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

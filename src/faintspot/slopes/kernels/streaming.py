@@ -11,8 +11,6 @@ Of the product of a reconstructor with the slopes, as much is computed as the ti
 groups whose rows are there are measured first.
 """
 
-from __future__ import annotations
-
 from functools import cache
 from typing import Any, NamedTuple
 

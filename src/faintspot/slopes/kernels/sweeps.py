@@ -12,8 +12,6 @@ References: Chambolle 2004 (J. Math. Imaging Vis. 20, 89), Beck & Teboulle 2009 
 18, 2419).
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 from faintspot.slopes.kernels.compiling import compiled, inlined, vector_registers

@@ -5,8 +5,6 @@ calibration is part of the weights: to gather whole windows would take several t
 What has bad pixels is left to `locate_window`.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Any, NamedTuple
 

@@ -1,7 +1,5 @@
 """Slopes of spots that leave their windows: windows that follow their spots from frame to frame."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Settings and tables that a pipeline computes before the first frame, in the form that kernels read."""
 
-from __future__ import annotations
-
 import math
 import threading
 from collections.abc import Callable

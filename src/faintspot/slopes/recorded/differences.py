@@ -1,7 +1,5 @@
 """Difference of two recordings of the same lenslets, whose layouts may differ."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Settings to begin with, from the flux, noise, spot width and displacements that a few frames show."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 from typing import Any

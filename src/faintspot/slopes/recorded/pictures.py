@@ -1,7 +1,5 @@
 """Figures of recorded slopes: a frame after every step, followed spots, and maps over all frames."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any

@@ -1,7 +1,5 @@
 """Sodium profile of recorded frames: fitted to their mean."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from typing import NamedTuple

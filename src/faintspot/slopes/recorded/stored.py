@@ -1,7 +1,5 @@
 """The report page of slopes that lie in files, and the figure of a sodium profile."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any

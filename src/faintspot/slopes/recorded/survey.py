@@ -1,7 +1,5 @@
 """First look at recorded frames: configuration, mean, saturation level, and response of the slopes."""
 
-from __future__ import annotations
-
 import shlex
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress

@@ -1,7 +1,5 @@
 """Layouts in the camera's pixels, and in those of binned frames."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Sub-apertures in the pupil of the telescope: their outlines, and the circle around them."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

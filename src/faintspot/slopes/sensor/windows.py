@@ -1,7 +1,5 @@
 """Windows around the lenslets found in a frame: size and position."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any

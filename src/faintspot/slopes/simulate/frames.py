@@ -1,7 +1,5 @@
 """Noisy images with known positions: stacks of sub-apertures and whole sensor frames."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from typing import Any, Unpack

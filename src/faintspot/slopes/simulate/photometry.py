@@ -1,7 +1,5 @@
 """Stars: magnitudes, and the photo-electrons that they give in a sub-aperture and frame."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, fields
 from functools import partial

@@ -4,8 +4,6 @@ The bound holds for unbiased estimators. An estimator that knows that positions 
 a smaller error at low flux; see `prior_std_px`.
 """
 
-from __future__ import annotations
-
 import functools
 import math
 from typing import Any, NamedTuple, Protocol, Unpack

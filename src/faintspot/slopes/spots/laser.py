@@ -1,7 +1,5 @@
 """Elongated spots of a laser guide star: the sodium profile seen from each sub-aperture."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from functools import cached_property

@@ -1,7 +1,5 @@
 """Table [laser] of a configuration or camera file: the elongated spots of a laser guide star."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field

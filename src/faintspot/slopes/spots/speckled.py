@@ -1,7 +1,5 @@
 """Short-exposure spots of a lenslet in turbulence: speckled, with a known position."""
 
-from __future__ import annotations
-
 import functools
 import math
 from typing import NamedTuple, Required, TypedDict, Unpack

@@ -1,7 +1,5 @@
 """The PSF that fits stacked spots best: a product of two profiles, and where the data ask for it more."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import NamedTuple
 

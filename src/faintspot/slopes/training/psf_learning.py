@@ -1,7 +1,5 @@
 """Learning a sensor's PSF from recorded frames alone, low-light ones if need be."""
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace

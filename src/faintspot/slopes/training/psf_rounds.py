@@ -1,7 +1,5 @@
 """Learning PSFs round by round: register every spot with the PSF so far, stack, fit, again."""
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -6,8 +6,6 @@ these g limit the interval: a test is inverted by parametric draws (Efron and Ti
 to the Bootstrap).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Slope discrepancy: the part of slopes that no wavefront can cause, a check of noise and calibration."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Wavefronts in words and in JSON files."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

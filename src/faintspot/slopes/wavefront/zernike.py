@@ -3,8 +3,6 @@
 Noll (1976), JOSA 66, 207: mode j has mean square 1 over the unit disk, and even j have the cosine.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import eval_jacobi

@@ -1,7 +1,5 @@
 """Controllers that learn from telemetry, and again from frames of their own loop, in a process beside it."""
 
-from __future__ import annotations
-
 import contextlib
 import math
 import os

@@ -1,7 +1,5 @@
 """From a recording to the loop and the filter of a controller."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 

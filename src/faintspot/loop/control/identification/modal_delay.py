@@ -7,8 +7,6 @@ does not depend on scale, so all delays and gains are compared by the shapes of 
 Vibrations count little, and their wings are a part of the sum.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import replace

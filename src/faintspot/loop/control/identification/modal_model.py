@@ -1,7 +1,5 @@
 """Measured properties of a controlled loop, and its model without geometry, of modes and their past."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace

@@ -1,7 +1,5 @@
 """Narrow-band vibrations of tip, tilt and focus in open-loop slopes."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Callable, Iterator, Sequence

@@ -1,7 +1,5 @@
 """Controller with the compiled Kalman filter and its fallback."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

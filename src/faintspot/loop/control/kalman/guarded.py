@@ -1,7 +1,5 @@
 """Learnt and plain controller on the same slopes, of which the one with less residual drives the mirror."""
 
-from __future__ import annotations
-
 import math
 from abc import abstractmethod
 from functools import partial

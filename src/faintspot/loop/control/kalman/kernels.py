@@ -4,8 +4,6 @@ What they do is written in NumPy in `guarded`, `predictive`, `predictor` and `ba
 their order.
 """
 
-from __future__ import annotations
-
 import math
 from functools import partial
 from pathlib import Path

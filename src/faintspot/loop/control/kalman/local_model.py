@@ -5,8 +5,6 @@ follow almost entirely from the same and the adjacent sub-apertures in the two f
 frame is proportional to the number of slopes, that of `models.SlopeModel` to its square.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Self

@@ -3,8 +3,6 @@
 The work of a frame is proportional to the number of slopes.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial

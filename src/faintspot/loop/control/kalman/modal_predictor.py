@@ -4,8 +4,6 @@ What the past of the strongest modes tells beyond that of each mode is added to 
 that the wind carries is in some modes before it is in others. No geometry of the sensor is known.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple

@@ -1,7 +1,5 @@
 """Kalman filter that predicts open-loop slopes, and its model: a vector autoregression of second order."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Self

@@ -1,7 +1,5 @@
 """Total-variation denoising (the method of the paper) or Gaussian smoothing, then brightest pixels."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property

@@ -1,7 +1,5 @@
 """Centre of gravity with a Gaussian weight; settings rows shared by estimators that know the spot."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial

@@ -5,8 +5,6 @@ the nodes that would have a spot are counted in a map of the distance to the nea
 start the matching from neighbour to neighbour, which also finds what is not linear.
 """
 
-from __future__ import annotations
-
 import itertools
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Lattices fitted to the spots of a frame, and the choice of the one that explains them best."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

@@ -7,8 +7,6 @@ as a minimum cut of the lattice graph (Greig, Porteous & Seheult 1989, J. R. Sta
 evidence of a node is never overruled; a column of doubtful nodes is included or excluded as a whole.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Find the lenslets of a Shack-Hartmann sensor in a frame: geometry, pitch, angle and illumination."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

@@ -5,8 +5,6 @@ noise is that of the same pixels. Haze, gradients and surrounding spots are ther
 and noise in one part of the frame does not hide spots in another.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 
