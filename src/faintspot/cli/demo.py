@@ -102,6 +102,8 @@ def write_files(
     folder: Path, comparison: Comparison, n_frames: int, rng: np.random.Generator
 ) -> dict[str, Any]:
     """Write new frames at one flux, measure them with and without denoising; return what it shows."""
+    from faintspot.slopes.pipeline.slopes import Slopes
+    from faintspot.slopes.recorded.pictures import Example
     from faintspot.slopes.recorded.statistics import MeasuredSlopes
 
     layout = demonstration.demonstration_layout()
@@ -118,10 +120,10 @@ def write_files(
         output = folder / f"{stem}.npz"
         with progress_bar(f"slopes, {name}") as advance:
             measure_recorded([folder / "frames.npy"], config, output, overwrite=True, progress=advance)
-        stored = read_slopes(output).variables
-        methods.append(MeasuredSlopes(name, *(stored[key] for key in ("x", "y", "flux", "flags"))))
+        methods.append(MeasuredSlopes(name, Slopes.from_variables(read_slopes(output).variables)))
         stages[name] = SlopePipeline.from_file(config).explain(frames[0])
-    return {"methods": methods, "layout": layout, "stages": stages, "truth": truth}
+    example = Example(layout, stages, 0, truth[0])
+    return {"methods": methods, "layout": layout, "shown": example, "truth": truth}
 
 
 def write_page(folder: Path, methods: list[MeasuredSlopes], **shown: Any) -> None:

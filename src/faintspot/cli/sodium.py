@@ -89,7 +89,7 @@ def command(
                 f"  centres of [layout] moved by up to {moved:.2f} px, to the spots' centres of gravity"
             )
     if drawing is not None:
-        from faintspot.slopes.recorded.stored import profile_figure
+        from faintspot.slopes.recorded.pictures import profile_figure
 
         before = {"before": known.star.focused(laser.profile)}
         write_picture(profile_figure({**before, "now": profile}).figure, drawing)

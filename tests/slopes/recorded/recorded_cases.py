@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from faintspot.base.report.page import Report
 from faintspot.slopes.pipeline.settings import Settings
 from faintspot.slopes.pipeline.slope_pipeline import SlopePipeline
-from faintspot.slopes.pipeline.slopes import Stages
+from faintspot.slopes.pipeline.slopes import Slopes, Stages
 from faintspot.slopes.recorded.statistics import MeasuredSlopes
 from faintspot.slopes.sensor.layout import Layout
 from faintspot.slopes.simulate import sensor_frames
@@ -32,9 +32,20 @@ def two_methods(layout: Layout, frames: NDArray[Any]) -> tuple[list[MeasuredSlop
     methods, stages = [], {}
     for name, settings in (("TV", SETTINGS), ("no TV", SETTINGS.replace(estimator="brightest"))):
         pipeline = SlopePipeline(layout, settings)
-        methods.append(MeasuredSlopes.of(name, pipeline(frames)))
+        methods.append(MeasuredSlopes(name, pipeline(frames)))
         stages[name] = pipeline.explain(frames[0])
     return methods, stages
+
+
+def method_of(
+    name: str, x: Any, y: Any, flux: Any = 1.0, flags: Any = 0, error_px: float = np.inf
+) -> MeasuredSlopes:
+    """Return slopes (n_frames, n_subapertures) with these values."""
+    zero = np.zeros(np.shape(x))
+    counts, errors = np.zeros(zero.shape, np.int32), np.full(zero.shape, error_px, np.float32)
+    flags = np.zeros(zero.shape, np.uint8) + np.asarray(flags, np.uint8)
+    arrays: Any = (x, y, zero + flux, flags, counts, counts, errors, errors, zero)
+    return MeasuredSlopes(name, Slopes(*arrays))
 
 
 @dataclass

@@ -5,7 +5,7 @@ from typing import Any
 import matplotlib
 import numpy as np
 import pytest
-from tests.slopes.recorded.recorded_cases import SETTINGS, sensor, simulated, two_methods
+from tests.slopes.recorded.recorded_cases import SETTINGS, method_of, sensor, simulated, two_methods
 
 from faintspot.base.report.plots import png
 from faintspot.slopes.estimators.built_in.total_variation import TotalVariation
@@ -17,7 +17,7 @@ from faintspot.slopes.recorded.pictures import (
     example_subapertures,
     sensor_figure,
 )
-from faintspot.slopes.recorded.statistics import MeasuredSlopes, jitter, summarise
+from faintspot.slopes.recorded.statistics import MeasuredSlopes, jitter
 from faintspot.slopes.sensor.layout import Layout
 
 
@@ -47,7 +47,7 @@ def test_example_positions_are_from_the_windows_middle() -> None:
     frame = simulated(plain, 1)[0][0]
     truth = np.zeros((9, 2))
     found = [
-        Example(layout, {"TV": SlopePipeline(layout, SETTINGS).explain(frame)}, truth).positions()
+        Example(layout, {"TV": SlopePipeline(layout, SETTINGS).explain(frame)}, 0, truth).positions()
         for layout in (plain, moved)
     ]
     # Where the centre is does not move the spot in the picture (float32 slopes).
@@ -76,39 +76,33 @@ def test_a_raw_frame_in_electrons_is_not_shown_twice() -> None:
 def test_users_style_is_neither_used_nor_changed() -> None:
     layout = sensor((1, 1))
     stages = {"TV": SlopePipeline(layout, SETTINGS).explain(simulated(layout, 1)[0][0])}
-    plain = png(sensor_figure(Example(layout, stages), 0).figure)
+    plain = png(sensor_figure(Example(layout, stages)).figure)
     with matplotlib.rc_context({"font.size": 30, "axes.facecolor": "black"}):
-        assert png(sensor_figure(Example(layout, stages), 0).figure) == plain
+        assert png(sensor_figure(Example(layout, stages)).figure) == plain
         assert matplotlib.rcParams["font.size"] == 30
 
 
 def slopes(wild: float = 0.0, n: int = 100, usual: float = 0.1) -> MeasuredSlopes:
     x = np.full((2, n), usual)
     x[:, 1] += wild
-    nothing = np.zeros(x.shape, np.uint8)
-    return MeasuredSlopes("TV", x, np.zeros_like(x), x + 5, flags=nothing)
+    return method_of("TV", x, np.zeros_like(x), x + 5)
 
 
 def test_arrows_are_cut_where_a_few_are_wild() -> None:
-    assert pictures.longest_arrow([summarise(slopes())]) == (0.1, 0)
-    longest, number = pictures.longest_arrow([summarise(slopes(50.0))])
+    assert pictures.longest_arrow([slopes()]) == (0.1, 0)
+    longest, number = pictures.longest_arrow([slopes(50.0)])
     assert longest == pytest.approx(0.15)
     assert number == 1
-    assert pictures.longest_arrow([summarise(slopes(usual=0.0))]) == (1.0, 0)
-
-
-def test_drawn_arrows_are_no_longer_than_the_limit() -> None:
-    layout = Layout.grid((10, 10), pixels=8)
-    summaries = [summarise(slopes(50.0))]
-    figure = pictures.arrows_figure([slopes(50.0)], summaries, layout).figure
+    assert pictures.longest_arrow([slopes(usual=0.0)]) == (1.0, 0)
+    figure = pictures.arrows_figure([slopes(50.0)], Layout.grid((10, 10), pixels=8)).figure
     arrows: Any = next(item for item in figure.axes[0].collections if hasattr(item, "U"))
-    assert np.hypot(arrows.U, arrows.V).max() == pytest.approx(pictures.longest_arrow(summaries)[0])
+    assert np.hypot(arrows.U, arrows.V).max() == pytest.approx(longest)
 
 
 def test_outlines_are_left_out_of_big_sensors() -> None:
     def drawn(side: int) -> int:
         method = slopes(n=side**2)
-        made = pictures.arrows_figure([method], [summarise(method)], Layout.grid((side, side), pixels=8))
+        made = pictures.arrows_figure([method], Layout.grid((side, side), pixels=8))
         return len(made.figure.axes[0].collections)
 
     assert drawn(30) == drawn(2) - 1
@@ -119,6 +113,5 @@ def test_one_frame_has_a_map_of_the_flux_alone() -> None:
     frames = simulated(layout, 2)[0]
     for n_frames, titles in ((1, ["TV: flux"]), (2, ["TV: median flux", "valid frames", "jitter"])):
         method = two_methods(layout, frames[:n_frames])[0][0]
-        scatter = jitter(method.x, method.y, method.valid)
-        figure = pictures.maps_figure([method], [summarise(method)], [scatter], layout).figure
+        figure = pictures.maps_figure([method], [jitter(method, method.valid)], layout).figure
         assert [title for panel in figure.axes if (title := panel.get_title())] == titles

@@ -1,6 +1,7 @@
 """The report page of telemetry that was recorded of a running engine."""
 
 from collections.abc import Iterator
+from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
@@ -24,7 +25,7 @@ from faintspot.engine.telemetry.numbers import (
 from faintspot.io.telemetry import Telemetry, read_telemetry
 from faintspot.slopes.pipeline.slopes import Slopes
 from faintspot.slopes.recorded.page import SlopesRun, slopes_sections, warnings_in_words
-from faintspot.slopes.recorded.statistics import ARRAYS, MeasuredSlopes
+from faintspot.slopes.recorded.statistics import MeasuredSlopes
 from faintspot.slopes.sensor.layout import Layout
 
 _TEXT = Texts("faintspot.slopes.recorded")
@@ -49,10 +50,10 @@ def report_of_telemetry(path: str | Path) -> Report:
         raise InputError(f"{path}: expected telemetry, no frame is recorded yet")
     layout = Layout(**telemetry.attributes["layout"])
     methods = [
-        MeasuredSlopes.of(name, _slopes(telemetry, rows), frames=telemetry.frame[rows].astype(np.int64))
+        MeasuredSlopes(name, _slopes(telemetry, rows), telemetry.frame[rows].astype(np.int64))
         for name, rows in _methods(telemetry)
     ]
-    run = SlopesRun(methods, layout, why_no_stages="")
+    run = SlopesRun(methods, layout)
     return Report(
         title=f"Telemetry of {Path(path).name}",
         facts=_facts(telemetry, Path(path)),
@@ -63,7 +64,7 @@ def report_of_telemetry(path: str | Path) -> Report:
             *slopes_sections(run),
             configuration_section(str(telemetry.attributes.get("settings", ""))),
         ],
-        warnings=[*_warnings(telemetry), *run.comparison.warnings(), *warnings_in_words(run)],
+        warnings=[*_warnings(telemetry), *warnings_in_words(run)],
         remark=POSITIONS,
     )
 
@@ -75,7 +76,7 @@ def _methods(telemetry: Telemetry) -> Iterator[tuple[str, NDArray[np.bool_]]]:
 
 
 def _slopes(telemetry: Telemetry, rows: NDArray[np.bool_]) -> Slopes:
-    names = (*ARRAYS, "iterations", "standard_error_x", "standard_error_y", "covariance_xy")
+    names = {field.name for field in fields(Slopes)} - {"bad_pixels", "keep"}
     arrays = {name: getattr(telemetry, name)[rows] for name in names}
     return Slopes(**arrays, bad_pixels=np.zeros(arrays["x"].shape, np.int32))
 

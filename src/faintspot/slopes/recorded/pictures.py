@@ -13,9 +13,10 @@ from faintspot.base.report.texts import Texts, plain_number
 from faintspot.slopes.estimators.base import Step
 from faintspot.slopes.estimators.built_in.total_variation import TotalVariation
 from faintspot.slopes.pipeline.slopes import Slopes, Stages
-from faintspot.slopes.recorded.statistics import Jitter, MeasuredSlopes, SlopesSummary
+from faintspot.slopes.recorded.statistics import MeasuredSlopes
 from faintspot.slopes.sensor.drawing import Arrows, Map, asinh_stretch, map_height
 from faintspot.slopes.sensor.layout import Layout
+from faintspot.slopes.spots.sodium import SodiumProfile
 
 Floats = NDArray[np.float64]
 
@@ -40,6 +41,8 @@ class Example:
     stages : mapping of Stages
         By method; images (n_subapertures, ny, nx). The first one's images are shown, the positions of all are
         marked. They must be measured from the sub-apertures' centres (no other reference).
+    number : int
+        Number of the frame in the recording.
     truth : array (n_subapertures, 2), optional
         True x, y, px.
     steps : sequence of Step
@@ -48,6 +51,7 @@ class Example:
 
     layout: Layout
     stages: Mapping[str, Stages]
+    number: int = 0
     truth: Floats | None = None
     steps: Sequence[Step] = TotalVariation.steps_shown
 
@@ -73,7 +77,7 @@ class Example:
         return positions
 
 
-def sensor_figure(example: Example, frame: int) -> FigureWithData:
+def sensor_figure(example: Example) -> FigureWithData:
     """Draw all windows of the calibrated frame at their places, with the positions of the spots."""
     layout, images = example.layout, example.first.calibrated
     sheet, start = assembled(layout, images), layout.corners.min(axis=0) - 0.5
@@ -85,7 +89,7 @@ def sensor_figure(example: Example, frame: int) -> FigureWithData:
     style = {"vmin": low, "vmax": high, "extent": extent}
     picture, width = plots.Picture(sheet, "e- per pixel", style=style, marks=marks), 0.62 * plots.WIDTH
     values = {
-        "frame": frame,
+        "frame": example.number,
         "marked": few,
         "circles": "" if example.truth is None else ", circles true ones",
     }
@@ -179,17 +183,20 @@ class Followed:
         Slopes of all frames [px].
     reference : array (n_subapertures, 2)
         Reference positions, px from the sub-apertures' centres.
+    layout : Layout
     """
 
     frame: NDArray[Any]
     number: int
     slopes: Slopes
-    reference: NDArray[np.float64]
+    reference: Floats
+    layout: Layout
 
-    def largest_pitches(self, layout: Layout) -> float:
-        """Return the largest displacement of a valid spot, in pitches."""
+    @property
+    def largest_pitches(self) -> float:
+        """Largest displacement of a valid spot, in pitches."""
         length = np.hypot(self.slopes.x, self.slopes.y)[self.slopes.valid]
-        return float(length.max(initial=0.0) / (layout.pitch_px or np.nan))
+        return float(length.max(initial=0.0) / (self.layout.pitch_px or np.nan))
 
 
 def farthest_frame(slopes: Slopes) -> int:
@@ -198,9 +205,9 @@ def farthest_frame(slopes: Slopes) -> int:
     return int(np.argmax(squares.sum(axis=1) / np.maximum(slopes.valid.sum(axis=1), 1)))
 
 
-def followed_figure(followed: Followed, layout: Layout) -> FigureWithData:
+def followed_figure(followed: Followed) -> FigureWithData:
     """Draw a frame with an arrow from each reference position to its spot, and the paths of all spots."""
-    slopes, number = followed.slopes, followed.number
+    slopes, number, layout = followed.slopes, followed.number, followed.layout
     nodes = layout.centres + followed.reference
     at = nodes + np.stack([slopes.x, slopes.y], axis=-1)
     shown = np.where(slopes.valid[..., None], at, np.nan)
@@ -230,54 +237,46 @@ def followed_figure(followed: Followed, layout: Layout) -> FigureWithData:
 
 
 def maps_figure(
-    methods: Sequence[MeasuredSlopes],
-    summaries: Sequence[SlopesSummary],
-    jitters: Sequence[Jitter],
-    layout: Layout,
+    methods: Sequence[MeasuredSlopes], jitters: Sequence[Floats], layout: Layout
 ) -> FigureWithData:
     """Draw flux, valid frames and jitter, a row of maps for each method; of one frame, flux only."""
     several = methods[0].n_frames > 1
-    flux_limits = plots.limits_of(*(summary.flux_e for summary in summaries), low=0.0)
-    jitter_limits = plots.limits_of(*(item.px for item in jitters), low=0.0)
+    flux_limits = plots.limits_of(*(method.flux_e for method in methods), low=0.0)
+    jitter_limits = plots.limits_of(*jitters, low=0.0)
     rows = []
-    for method, summary, item in zip(methods, summaries, jitters, strict=True):
+    for method, jitter_px in zip(methods, jitters, strict=True):
         name = f"{method.name}: {'median ' if several else ''}flux"
-        row = [Map(layout, summary.flux_e, "flux (e-)", name, flux_limits)]
+        row = [Map(layout, method.flux_e, "flux (e-)", name, flux_limits)]
         if several:
-            percent = 100.0 * summary.valid_frames / method.n_frames
+            percent = 100.0 * method.valid_frames / method.n_frames
             row.append(Map(layout, percent, "valid frames (%)", "valid frames", (0, 100)))
-            row.append(Map(layout, item.px, "jitter (px)", "jitter", jitter_limits))
+            row.append(Map(layout, jitter_px, "jitter (px)", "jitter", jitter_limits))
         rows.append(row)
-    columns = len(rows[0])
     width = plots.WIDTH if several else 0.6 * plots.WIDTH
-    return _TEXT.figure(
-        "flux", rows, len(rows) * map_height(layout, columns), {"several": several}, width=width
-    )
+    height = len(rows) * map_height(layout, len(rows[0]))
+    return _TEXT.figure("flux", rows, height, {"several": several}, width=width)
 
 
-def arrows_figure(
-    methods: Sequence[MeasuredSlopes], summaries: Sequence[SlopesSummary], layout: Layout
-) -> FigureWithData:
+def arrows_figure(methods: Sequence[MeasuredSlopes], layout: Layout) -> FigureWithData:
     """Draw the mean slope of every sub-aperture, one panel per method, all at one scale.
 
     Those longer than `longest_arrow` are cut to that length and drawn black.
     """
-    longest, number = longest_arrow(summaries)
+    longest, number = longest_arrow(methods)
     pitch, several = layout.pitch_px or max(layout.window), methods[0].n_frames > 1
     length, width = (0.6, 0.004) if len(layout) <= _MOST_SHORT_ARROWS else (2.0, 0.0015)
     maps = []
-    for method, summary, colour in zip(methods, summaries, plots.METHOD_COLOURS, strict=False):
-        slopes = np.stack([summary.x_px, summary.y_px], axis=-1)
-        known, long = np.isfinite(summary.x_px), np.hypot(*slopes.T)
-        shown = (slopes * np.minimum(1.0, longest / np.maximum(long, longest))[:, None])[known]
+    for method, colour in zip(methods, plots.METHOD_COLOURS, strict=False):
+        known, long = method.valid_frames > 0, np.hypot(*method.mean_px.T)
+        shown = (method.mean_px * np.minimum(1.0, longest / np.maximum(long, longest))[:, None])[known]
         colours = np.where(long > longest, "black", colour)[known]
         style = {"color": colours, "scale": longest / (length * pitch), "width": width}
-        cross = plots.Line.of(
-            "", layout.centres[~known], {"ls": "", "marker": "x", "color": plots.GREY, "ms": 5}
-        )
+        cross = {"ls": "", "marker": "x", "color": plots.GREY, "ms": 5}
         arrows = Arrows(layout.centres[known], shown, style, _round_length(longest))
         title = f"{method.name}: {'mean slope' if several else 'slope'}"
-        maps.append(Map(layout, title=title, marks=[arrows, cross]))
+        maps.append(
+            Map(layout, title=title, marks=[arrows, plots.Line.of("", layout.centres[~known], cross)])
+        )
     values = {
         "longest": longest,
         "percent": _ARROWS_WHOLE_PERCENT,
@@ -288,14 +287,13 @@ def arrows_figure(
     return _TEXT.figure("slopes", [maps], map_height(layout, len(maps)), values, width=figure_width)
 
 
-def longest_arrow(summaries: Sequence[SlopesSummary]) -> tuple[float, int]:
+def longest_arrow(methods: Sequence[MeasuredSlopes]) -> tuple[float, int]:
     """Return the length, px, at which arrows are cut, and how many are longer.
 
     It is a percentile, so that a few wild slopes do not make all others too short to be seen; lengths within
     half of it more are left as they are.
     """
-    lengths = np.concatenate([np.hypot(summary.x_px, summary.y_px) for summary in summaries])
-    lengths = lengths[np.isfinite(lengths)]
+    lengths = np.concatenate([np.hypot(*method.mean_px[method.valid_frames > 0].T) for method in methods])
     usual = float(np.percentile(lengths, _ARROWS_WHOLE_PERCENT)) if lengths.size else 0.0
     if usual <= 0:
         return float(lengths.max(initial=0.0)) or 1.0, 0
@@ -307,3 +305,18 @@ def _round_length(length: float) -> float:
     """Return the largest of 1, 2, 5 times a power of ten that is not above a length."""
     power = 10.0 ** np.floor(np.log10(length))
     return float(max(step * power for step in (1, 2, 5) if step * power <= length * (1 + 1e-9)))
+
+
+def profile_figure(profiles: Mapping[str, SodiumProfile]) -> FigureWithData:
+    """Draw the density of profiles against altitude; the last one is emphasised."""
+    *_, newest = profiles
+    lines = []
+    for index, (name, profile) in enumerate(profiles.items()):
+        style: dict[str, object] = {"color": plots.METHOD_COLOURS[1], "lw": 2.2}
+        if name != newest:
+            style = {"color": plots.GREY, "lw": 1.6, "ls": ("--", ":", "-.")[index % 3]}
+        label = f"{name}\n(mean {profile.mean_m / 1e3:.1f} km, std {profile.std_m / 1e3:.1f} km)"
+        lines.append(plots.Line(label, 1e3 * profile.density, profile.altitudes_m / 1e3, style=style))
+    flux, height = "return flux per km of altitude", "altitude above sea level (km)"
+    panel = plots.Panel(lines, flux, height, x_range=(0, None), legend=True)
+    return _TEXT.figure("sodium", [[panel]], 4.6, width=0.6 * plots.WIDTH, legend="")

@@ -1,43 +1,27 @@
-"""The report page of slopes that lie in files, and the figure of a sodium profile."""
+"""The report page of slopes that lie in files."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from faintspot.base.checks import not_none
 from faintspot.base.errors import InputError
 from faintspot.base.flags import leave_out
-from faintspot.base.report.page import FigureWithData, Report
-from faintspot.base.report.plots import GREY, METHOD_COLOURS, WIDTH, Line, Panel
+from faintspot.base.report.page import Report
 from faintspot.base.report.texts import Texts
 from faintspot.io import open_frames
-from faintspot.io.frames import FrameSource
-from faintspot.slopes.estimators.built_in.total_variation import TotalVariation
+from faintspot.io.slopes import subtracted_reference
 from faintspot.slopes.pipeline.slopes import Slopes, Stages
-from faintspot.slopes.recorded.page import SlopesRun, slopes_report
-from faintspot.slopes.recorded.pictures import Followed, farthest_frame
+from faintspot.slopes.recorded.page import NO_LAYOUT, SlopesRun, slopes_report
+from faintspot.slopes.recorded.pictures import Example, Followed, farthest_frame
 from faintspot.slopes.recorded.statistics import MeasuredSlopes
 from faintspot.slopes.recorded.stored_run import StoredRun, open_run
-from faintspot.slopes.spots.sodium import SodiumProfile
+from faintspot.slopes.sensor.layout import Layout
 
 _TEXT = Texts("faintspot.slopes.recorded")
-
-
-def profile_figure(profiles: Mapping[str, SodiumProfile]) -> FigureWithData:
-    """Draw the density of profiles against altitude; the last one is emphasised."""
-    *_, newest = profiles
-    lines = []
-    for index, (name, profile) in enumerate(profiles.items()):
-        style: dict[str, object] = {"color": METHOD_COLOURS[1], "lw": 2.2}
-        if name != newest:
-            style = {"color": GREY, "lw": 1.6, "ls": ("--", ":", "-.")[index % 3]}
-        label = f"{name}\n(mean {profile.mean_m / 1e3:.1f} km, std {profile.std_m / 1e3:.1f} km)"
-        lines.append(Line(label, 1e3 * profile.density, profile.altitudes_m / 1e3, style=style))
-    flux, height = "return flux per km of altitude", "altitude above sea level (km)"
-    panel = Panel(lines, flux, height, x_range=(0, None), legend=True)
-    return _TEXT.figure("sodium", [[panel]], 4.6, width=0.6 * WIDTH, legend="")
 
 
 _SAME_PLACE_PX = 1e-4  # the text of a configuration is rounded
@@ -75,17 +59,8 @@ def report_of_stored(paths: Sequence[str | Path], *, frames: Sequence[str | Path
             raise InputError(f"{first.path}: expected two different files of slopes, got the same twice")
         _check_same_sensor(first, store)
     methods, notes = _methods(stores)
-    total = np.where(methods[0].valid, methods[0].flux, 0.0).sum(axis=1)
-    example_frame = int(np.argsort(total, kind="stable")[(len(total) - 1) // 2])
-    followed, stages = None, dict[str, Stages]()
-    if any(store.followed for store in stores):
-        followed, reason = _followed(first, frames)
-    else:
-        stages, reason = _example(stores, methods, example_frame, frames, notes)
-    steps = (first.estimator or TotalVariation).steps_shown
-    run = SlopesRun(methods, first.layout, stages, None, example_frame, reason, steps, followed)
     return slopes_report(
-        run,
+        SlopesRun(methods, first.layout, _shown(stores, methods, frames, notes)),
         title=f"Slopes of {' and '.join(store.path.name for store in stores)}",
         facts=_facts(stores, methods),
         configurations=_configurations(stores, methods),
@@ -107,7 +82,7 @@ def _labelled_notes(stores: Sequence[StoredRun], methods: Sequence[MeasuredSlope
     notes = []
     for store, method in zip(stores, methods, strict=True):
         label = f"{method.name}: " if len(methods) > 1 else ""
-        _, left_out = leave_out(method.flags, method.keep)
+        _, left_out = leave_out(method.slopes.flags, method.slopes.keep)
         notes += [label + note for note in store.notes]
         notes += [f"{label}{left_out}." if label else f"{left_out.capitalize()}."] if left_out else []
     return notes
@@ -141,7 +116,7 @@ def _methods(stores: Sequence[StoredRun]) -> tuple[list[MeasuredSlopes], list[st
     methods = []
     for name, store in zip(_names(stores), stores, strict=True):
         slopes = Slopes.from_variables(store.stored.variables, min(counts), store.keep)
-        methods.append(MeasuredSlopes.of(name, slopes))
+        methods.append(MeasuredSlopes(name, slopes))
     return methods, notes
 
 
@@ -153,59 +128,61 @@ def _names(stores: Sequence[StoredRun]) -> list[str]:
     return names if len(set(names)) == len(names) else [str(store.path) for store in stores]
 
 
-def _example(
+def _shown(
     stores: Sequence[StoredRun],
     methods: Sequence[MeasuredSlopes],
-    number: int,
     frames: Sequence[str | Path] | None,
     notes: list[str],
-) -> tuple[dict[str, Stages], str]:
-    """Measure the example frame again in every method; or return why that cannot be done."""
+) -> Example | Followed | str:
+    """Return the frame of the pictures, or why there is none; add notes."""
     if stores[0].layout is None:
-        return {}, "Not drawn: the layout is not known."
+        return NO_LAYOUT
     try:
-        frame = _frame(stores[0], number, frames)
-        stages: dict[str, Stages] = {}
-        for store, method in zip(stores, methods, strict=True):
-            stages[method.name] = store.pipeline().explain(frame)
-            notes += _disagreement(store, method, frame, number)
-        estimator = stores[0].estimator
-        without = None if estimator is None else estimator.without_denoising()
-        if len(stores) == 1 and without is not None:
-            stages[without.label] = stores[0].pipeline(without).explain(frame)
+        if any(store.followed for store in stores):
+            return _followed(stores[0], stores[0].layout, methods[0].slopes, frames)
+        return _example(stores, stores[0].layout, methods, frames, notes)
     except InputError as error:
-        return {}, f"Not drawn: {error}."
-    return stages, ""
+        return f"Not drawn: {error}."
 
 
-def _followed(store: StoredRun, frames: Sequence[str | Path] | None) -> tuple[Followed | None, str]:
-    """Return the spots that were followed and the frame of their picture; or why there is none."""
-    slopes = Slopes.from_variables(store.stored.variables, keep=store.keep)
+def _example(
+    stores: Sequence[StoredRun],
+    layout: Layout,
+    methods: Sequence[MeasuredSlopes],
+    frames: Sequence[str | Path] | None,
+    notes: list[str],
+) -> Example:
+    """Measure the frame with the median total flux again in every method."""
+    total = np.where(methods[0].valid, methods[0].slopes.flux, 0.0).sum(axis=1)
+    number = int(np.argsort(total, kind="stable")[(len(total) - 1) // 2])
+    frame = _frame(stores[0], number, frames)
+    stages: dict[str, Stages] = {}
+    for store, method in zip(stores, methods, strict=True):
+        stages[method.name] = store.pipeline().explain(frame)
+        notes += _disagreement(store, method, frame, number)
+    estimator = not_none(stores[0].estimator)
+    if len(stores) == 1 and (without := estimator.without_denoising()) is not None:
+        stages[without.label] = stores[0].pipeline(without).explain(frame)
+    return Example(layout, stages, number, steps=estimator.steps_shown)
+
+
+def _followed(
+    store: StoredRun, layout: Layout, slopes: Slopes, frames: Sequence[str | Path] | None
+) -> Followed:
+    """Return the spots that were followed and the frame of their picture."""
     number = farthest_frame(slopes)
-    n = slopes.x.shape[1]
-    reference = np.asarray(store.stored.attributes.get("reference", np.zeros((n, 2))))
-    reference = reference.reshape(n, 2) if reference.ndim == 2 else reference.reshape(2, n).T
-    try:
-        return Followed(_frame(store, number, frames), number, slopes, reference), ""
-    except InputError as error:
-        return None, f"Not drawn: {error}."
+    return Followed(_frame(store, number, frames), number, slopes, subtracted_reference(store.stored), layout)
 
 
-def _source(store: StoredRun, frames: Sequence[str | Path] | None) -> FrameSource:
-    """Open the frames of a run."""
+def _frame(store: StoredRun, number: int, frames: Sequence[str | Path] | None) -> NDArray[Any]:
+    """Return a frame of the files given, or of those that the run measured."""
     locations = list(frames) if frames is not None else store.sources
     if not locations:
         raise InputError(f"{store.path.name} does not say where its frames came from")
     known = store.stored.attributes
-    return open_frames(
-        locations, key=known.get("source_key") or None, time_axis=known.get("source_time_axis")
-    )
-
-
-def _frame(store: StoredRun, number: int, frames: Sequence[str | Path] | None) -> NDArray[Any]:
-    with _source(store, frames) as source:
-        frame: NDArray[Any] = source.block(number, number + 1)[0]
-    return frame
+    reading = {"key": known.get("source_key") or None, "time_axis": known.get("source_time_axis")}
+    with open_frames(locations, **reading) as source:
+        return np.asarray(source.block(number, number + 1)[0])
 
 
 def _disagreement(store: StoredRun, method: MeasuredSlopes, frame: NDArray[Any], number: int) -> list[str]:
@@ -213,7 +190,7 @@ def _disagreement(store: StoredRun, method: MeasuredSlopes, frame: NDArray[Any],
     slopes = store.pipeline(reference=store.stored.attributes.get("reference"))(frame)
     valid = slopes.valid & method.valid[number]
     again = np.stack([slopes.x, slopes.y])[:, valid]
-    distance = np.abs(again - np.stack([method.x[number], method.y[number]])[:, valid])
+    distance = np.abs(again - np.stack([method.slopes.x[number], method.slopes.y[number]])[:, valid])
     if distance.size == 0 or distance.max() <= _SAME_POSITION_PX:
         return []
     names = {"frame": number, "file": store.path.name}
