@@ -133,7 +133,9 @@ def errors_of_options(where: object) -> Iterator[None]:
     except InputError as error:
         given = error.name in click.get_current_context().params
         name = flag_of(error.name) if given else error.name
-        raise InputError(error.expected, name=name, value=error.value).within(where) from None
+        raise InputError(error.expected, name=name, value=error.value, where=error.where).within(
+            where
+        ) from None
 
 
 def declared(

@@ -20,12 +20,16 @@ from faintspot.experiments.demonstration import Comparison
 from faintspot.io.slopes import read_slopes
 from faintspot.slopes.pipeline import configuration
 from faintspot.slopes.pipeline.slope_pipeline import SlopePipeline
+from faintspot.slopes.pipeline.slopes import Slopes
 from faintspot.slopes.recorded import measure_recorded
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
     from rich.table import Table
 
+    from faintspot.slopes.pipeline.slopes import Stages
     from faintspot.slopes.recorded.statistics import MeasuredSlopes
+    from faintspot.slopes.sensor.layout import Layout
 
 
 @click.command()
@@ -102,8 +106,6 @@ def write_files(
     folder: Path, comparison: Comparison, n_frames: int, rng: np.random.Generator
 ) -> dict[str, Any]:
     """Write new frames at one flux, measure them with and without denoising; return what it shows."""
-    from faintspot.slopes.pipeline.slopes import Slopes
-    from faintspot.slopes.recorded.pictures import Example
     from faintspot.slopes.recorded.statistics import MeasuredSlopes
 
     layout = demonstration.demonstration_layout()
@@ -122,13 +124,19 @@ def write_files(
             measure_recorded([folder / "frames.npy"], config, output, overwrite=True, progress=advance)
         methods.append(MeasuredSlopes(name, Slopes.from_variables(read_slopes(output).variables)))
         stages[name] = SlopePipeline.from_file(config).explain(frames[0])
-    example = Example(layout, stages, 0, truth[0])
-    return {"methods": methods, "layout": layout, "shown": example, "truth": truth}
+    return {"methods": methods, "layout": layout, "stages": stages, "truth": truth}
 
 
-def write_page(folder: Path, methods: list[MeasuredSlopes], **shown: Any) -> None:
+def write_page(
+    folder: Path,
+    methods: list[MeasuredSlopes],
+    layout: Layout,
+    stages: dict[str, Stages],
+    truth: NDArray[np.float64],
+) -> None:
     """Make the report."""
     from faintspot.slopes.recorded.page import SlopesRun, slopes_report
+    from faintspot.slopes.recorded.pictures import Example
 
     facts = {
         "Source": "simulated, with known truth",
@@ -137,7 +145,7 @@ def write_page(folder: Path, methods: list[MeasuredSlopes], **shown: Any) -> Non
         "Camera": "EMCCD, gain 500, read noise 45 e- at the output (0.09 e- referred to photo-electrons)",
     }
     report = slopes_report(
-        SlopesRun(methods, **shown),
+        SlopesRun(methods, layout, Example(layout, stages, 0, truth[0]), truth),
         title="faintspot demonstration",
         facts=facts,
         configurations={"Configuration": (folder / "tv.toml").read_text(encoding="utf-8")},

@@ -1,8 +1,9 @@
 """faintspot layout: find the sub-apertures in a frame."""
 
+import math
 import shlex
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -10,11 +11,9 @@ from typing import Any
 
 import click
 import numpy as np
-from numpy.typing import NDArray
 
 from faintspot.base.errors import DoubtWarning, InputError
-from faintspot.base.tables import save_tables
-from faintspot.cli import layout_options
+from faintspot.base.tables import is_map, save_tables
 from faintspot.cli.commands import (
     KEY,
     NAMES,
@@ -23,36 +22,34 @@ from faintspot.cli.commands import (
     SectionedCommand,
     declared,
     errors_of_options,
+    flag_of,
     option,
     suggested_slopes,
 )
-from faintspot.cli.layout_completing import (
-    clearer_frame,
-    completed,
-    describe_grid,
-    illuminated,
-    measured_darks,
-    with_measured_pixels,
-)
-from faintspot.cli.layout_options import describe, describe_settings, doubts_of, plain
 from faintspot.cli.output import picture_file
-from faintspot.io.frames import FrameSource, open_frames
-from faintspot.slopes.camera.calibration import Calibration, binned
-from faintspot.slopes.camera.frame_checks import MeanFrame, find_hot_pixels, misread, mosaic_contrast
+from faintspot.io.frames import open_frames
+from faintspot.slopes.camera.calibration import Calibration
 from faintspot.slopes.pipeline import configuration
 from faintspot.slopes.pipeline.settings import Settings
-from faintspot.slopes.recorded.first_settings import ASSUMED_NOISE_E, first_settings
-from faintspot.slopes.recorded.survey import UsualFrames, survey
-from faintspot.slopes.sensor.found_layout import FoundLayout, KnownGrid, find_layout
+from faintspot.slopes.recorded.first_layout import (
+    FirstLayout,
+    first_layout,
+    is_quad_cell,
+    plain,
+    stated_calibration,
+    stated_optics,
+)
+from faintspot.slopes.recorded.first_settings import FirstSettings
+from faintspot.slopes.sensor.found_layout import FoundLayout
 from faintspot.slopes.sensor.layout import GEOMETRIES, LARGEST_BIN, OPTICS, Layout
+from faintspot.slopes.sensor.window_checks import LARGEST_WINDOW, reference_in_words
 
-_MOST_FRAMES = 200  # averaged to find the spots
-_FIRST_FRAMES = 20  # measured for the settings
-_FEWEST_E = 10.0  # electrons of a spot that is seen in a single frame
 _array = partial(option, section="Lenslet array")
 _windows = partial(option, section="Windows")
 _camera = partial(option, section="Camera")
 _CALIBRATION = ("dark", "flat", "bad_pixels", "gain_e_per_adu", "read_noise_e")
+_ONLY_WITHOUT = ("geometry", "pitch_px", "angle_deg", "centre", "fit", "move_windows")  # a grid
+_LARGE_PX = 0.03  # constant error at the pupil's edge
 
 
 @click.command(cls=SectionedCommand)
@@ -104,6 +101,7 @@ _CALIBRATION = ("dark", "flat", "bad_pixels", "gain_e_per_adu", "read_noise_e")
 @_array(
     "--exclude",
     type=RANGES,
+    default=(),
     metavar="LIST",
     help="Sub-apertures to leave out, such as 3,17,40-45: their numbers in the picture drawn without this.",
 )
@@ -118,10 +116,10 @@ _CALIBRATION = ("dark", "flat", "bad_pixels", "gain_e_per_adu", "read_noise_e")
     "--bin",
     "factor",
     type=click.IntRange(1, LARGEST_BIN),
+    default=1,
     metavar="N",
     help="Measure in sums of N x N pixels, for windows over 64 px and colour mosaics; all results are in "
     "the camera's pixels.",
-    show_default="1",
 )
 @_windows(
     "--move-windows",
@@ -164,9 +162,6 @@ def command(
     output: str,
     picture: str | None,
     grid: str | None,
-    exclude: list[int] | None,
-    factor: int | None,
-    mask_hot_pixels: bool,
     key: str | None,
     time_axis: int | None,
     overwrite: bool,
@@ -203,90 +198,33 @@ def command(
     keeps_settings = configuration.has(target, "settings") and not configuration.has(target, "layout")
     if target.exists() and not overwrite and not keeps_settings:
         raise InputError(f"{output}: already exists; --overwrite replaces its layout and settings")
-    if options["pixels"] is not None and len(options["pixels"]) == 1:
-        (options["pixels"],) = options["pixels"]
-    optics = layout_options.optics(target, {name: options.pop(name) for name in OPTICS})
-    of_camera = {name: options.pop(name) for name in _CALIBRATION}
+    optics = stated_optics(target, {name: options.pop(name) for name in OPTICS})
+    given = {name: options.pop(name) for name in _CALIBRATION}
     drawing = picture_file(target, picture, ".png")
+    if grid is not None:
+        options = _options_of_grid(grid, options)
     with open_frames(frames, key=key, time_axis=time_axis) as source:
-        calibration = layout_options.calibration(target, of_camera)
-        stated = layout_options.kept_calibration(calibration, of_camera)
-        mean, first, saturation_adu, notes = _seen_frames(source, calibration)
-        hot = find_hot_pixels(mean) if mask_hot_pixels else np.empty((0, 2), int)
-        mean[tuple(hot.T)] = np.nan
-        factor, shown = factor or 1, mean
-        if grid is None:
-            shown, unused = clearer_frame(mean, calibration)
-            stated += unused
-        if factor > 1:
-            shown, options = binned(shown, factor).astype(np.float64), layout_options.binned(options, factor)
-        found: FoundLayout | KnownGrid
-        if grid is not None:
-            found = illuminated(source.description, shown, grid, calibration, options)
-        else:
-            found = _found(source.description, shown, options)
-        if factor > 1:
-            found = found.magnified(factor, source.shape)
-        kept = layout_options.kept(len(found.layout), exclude)
-        if isinstance(found, FoundLayout):
-            found = found[kept]
-            layout = replace(found.layout, **optics, doubts=doubts_of(found))
-        else:
-            layout = replace(found.layout[kept], **optics, doubts=(found.doubt,) if found.doubt else ())
-    calibration, lines = completed(calibration, found, layout, mean, hot)
-    notes += lines
-    if source.note:
-        notes.append(f"  {source.description}: {source.note}")
-    if calibration.saturation_adu is None and saturation_adu is not None:
-        estimated = (*calibration.estimated, "saturation_adu")
-        calibration = replace(calibration, saturation_adu=saturation_adu, estimated=estimated)
-        notes.append(f"  saturation {saturation_adu:g} ADU, at which values pile up")
-    unit = "ADU" if of_camera["gain_e_per_adu"] is None and calibration.gain_e_per_adu == 1.0 else "e-"
-    seen = first_settings(layout, calibration, first)
-    if unit == "ADU" and 0 < seen.flux < _FEWEST_E:
-        likely = float(f"{(calibration.typical_read_noise_e or ASSUMED_NOISE_E) / seen.noise:.3g}")
-        notes.append(f"  gain: 1 would leave {plain(seen.flux)} electrons of a spot; {likely:g} is assumed")
-        estimated = (*calibration.estimated, "gain_e_per_adu")
-        calibration = replace(calibration, gain_e_per_adu=likely, estimated=estimated)
-        unit, seen = "e-", first_settings(layout, calibration, first)
-    if (measured := measured_darks(of_camera["dark"])) is not None:
-        keeps_noise = of_camera["read_noise_e"] is not None
-        calibration, lines = with_measured_pixels(calibration, measured, keeps_noise=keeps_noise)
-        notes += lines
-    if isinstance(found, FoundLayout) and not seen.flux > 0:
-        raise InputError(
-            f"{source.description}: expected spots, found none in the {len(layout)} windows of the layout; "
-            "average more frames, or look whether the frames are read right"
-        )
-    if calibration.read_noise_e is None and seen.noise > 0:
-        noise = float(f"{seen.noise * calibration.em_gain:.3g}")
-        estimated = (*calibration.estimated, "read_noise_e")
-        calibration = replace(calibration, read_noise_e=noise, estimated=estimated)
-    settings = Settings.load(target) if keeps_settings else seen.settings
-    if seen.doubt and not keeps_settings:
-        layout = replace(layout, doubts=(*layout.doubts, seen.doubt))
+        calibration = stated_calibration(target, given)
+        with errors_of_options(""):
+            found = first_layout(source, calibration, given, optics=optics, **options)
+    settings = found.seen.settings
     if keeps_settings:
-        notes.append(f"  the settings that {output} has are kept")
-    marks: dict[str, Any] = {}
-    if isinstance(found, FoundLayout):
-        left_out = np.concatenate([found.outside, found.cut])
-        marks = {"outside": left_out, "doubtful": found.clipped | found.unlike}
+        settings = Settings.load(target)
+        found.notes.append(f"the settings that {output} has are kept")
+    elif found.seen.doubt:
+        found.layout = replace(found.layout, doubts=(*found.layout.doubts, found.seen.doubt))
     if drawing is not None:
-        from faintspot.slopes.sensor.drawing import layout_picture
-
-        layout_picture(np.where(np.isnan(mean), np.nanmedian(mean), mean), layout, drawing, **marks)
+        _draw(found, drawing)
     # The layout last: it may be long, and whatever is saved after it reads it again.
-    if seen.psf is not None and not keeps_settings:
-        save_tables(target, {"psf": seen.psf})
-    for item in (settings, calibration, layout):
+    if found.seen.psf is not None and not keeps_settings:
+        save_tables(target, {"psf": found.seen.psf})
+    for item in (settings, found.calibration, found.layout):
         configuration.save(target, item)
-    if isinstance(found, KnownGrid):
-        lines = describe_grid(output, found, layout, calibration)
-    else:
-        lines = describe(output, found, layout)
-    for line in [*lines, *describe_settings(settings, layout, seen, unit), *stated, *notes]:
-        click.echo(line)
-    if unit == "ADU":
+    summary, *lines = describe(found, settings)
+    click.echo(f"{output}: {summary}")
+    for line in [*lines, *_kept_calibration(calibration, given), *found.notes]:
+        click.echo(f"  {line}")
+    if found.unit == "ADU":
         click.echo(
             "  gain unknown (--gain-e-per-adu): these settings do not depend on it, standard errors do"
         )
@@ -309,58 +247,120 @@ def _accept(target: Path, accept: bool, frames: tuple[str, ...]) -> None:
     click.echo(f"{target}: {'accepted: ' + '; '.join(layout.doubts) if layout.doubts else 'no doubts'}")
 
 
-def _found(description: str, mean: NDArray[np.float64], options: Mapping[str, object]) -> FoundLayout:
-    """Find the layout, and say in an error where, and which option changes it."""
-    bad = np.isnan(mean)
-    with errors_of_options(description):
-        found = find_layout(np.where(bad, 0, mean), bad_pixels=bad, **options)
-    grid = found.lenslets
-    if (contrast := mosaic_contrast(mean, grid.spots, grid.pitch_px, grid.spot_px)) > 1:
-        raise InputError(
-            f"{description}: pixels of even and odd rows and columns differ by a factor of {contrast:.2g} in "
-            "the spots, as in raw frames of a colour camera (Bayer mosaic); --bin 2 (bin = 2 in [layout]) "
-            "sums them, --flat with a flat field in the same light corrects them"
+def _options_of_grid(text: str, options: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the options that go with an array such as 7x7, which fills the frame."""
+    rows, _, columns = text.lower().partition("x")
+    if not (rows.isdecimal() and columns.isdecimal() and int(rows) * int(columns) > 0):
+        raise InputError(f"--grid {text}: expected rows and columns of lenslets, such as 7x7")
+    wrong = [flag_of(name) for name in _ONLY_WITHOUT if options[name] not in (None, False, "auto", ())]
+    if wrong:
+        raise InputError(f"--grid, {', '.join(wrong)}: expected one of them; a grid fills the frame or --roi")
+    kept = {name: value for name, value in options.items() if name not in _ONLY_WITHOUT}
+    return {**kept, "grid": (int(rows), int(columns))}
+
+
+def _draw(first: FirstLayout, path: Path) -> None:
+    """Write the picture of the frame and the windows."""
+    from faintspot.slopes.sensor.drawing import layout_picture
+
+    marks: dict[str, Any] = {}
+    if isinstance(first.found, FoundLayout):
+        left_out = np.concatenate([first.found.outside, first.found.cut])
+        marks = {"outside": left_out, "doubtful": first.found.clipped | first.found.unlike}
+    frame = np.where(np.isnan(first.mean), np.nanmedian(first.mean), first.mean)
+    layout_picture(frame, first.layout, path, **marks)
+
+
+def describe(first: FirstLayout, settings: Settings) -> list[str]:
+    """Describe the sub-apertures, those left out, and the settings, a line each."""
+    layout, found, seen, unit = first.layout, first.found, first.seen, first.unit
+    rows, columns = np.ptp(layout.cells, axis=0) + 1
+    height, width = layout.window
+    lines = [
+        f"{len(layout)} sub-apertures lit of a {layout.geometry} array of {rows} x {columns}, pitch "
+        f"{layout.pitch_px:.2f} px, angle {layout.angle_deg:.2f} deg, windows of {height} x {width} px"
+    ]
+    side, most = max(layout.window), LARGEST_WINDOW * layout.bin
+    if side >= most and layout.pitch_px is not None and layout.pitch_px >= side + 1:
+        lines.append(
+            f"windows stop at {most} px, of a pitch of {layout.pitch_px:.0f} px: spots farther than "
+            f"{most // 2} px from their centre are missed; --bin {layout.bin + 1} allows larger ones"
         )
-    return found
-
-
-def _seen_frames(
-    source: FrameSource, calibration: Calibration
-) -> tuple[NDArray[np.float64], NDArray[np.generic], float | None, list[str]]:
-    """Return the mean of the first usual frames [electrons], the first of them, their saturation, and notes.
-
-    The mean is NaN where no frame is finite.
-    """
-    count = min(_MOST_FRAMES, source.n_frames)
-
-    def blocks() -> Iterator[NDArray[np.generic]]:
-        return (block for _, block in source.blocks(0, count, _FIRST_FRAMES))
-
-    frames, notes = UsualFrames(), []
-    seen = survey(source.shape, map(frames.seen, blocks()))
-    unlike, repeated = frames.unlike, frames.repeated
-    if (unlike | repeated).all():
-        unlike, repeated = np.zeros((2, count), bool)
-    usual = ~(unlike | repeated)
-    if reason := misread(source.block(int(usual.argmax()), int(usual.argmax()) + 1)[0]):
-        raise InputError(f"{source.description}: {reason}")
-    mean = seen.mean
-    if not usual.all():
-        mean_frame, flags = MeanFrame(source.shape), iter(usual)
-        for block in blocks():
-            mean_frame.add(block[[next(flags) for _ in block]])
-        mean = mean_frame.mean
-    if unlike.any():
-        notes.append(
-            f"  {np.count_nonzero(unlike)} of {count} frames left out: at least twice as bright or half as "
-            "bright as most, or with another background"
+    lines += [f"doubtful: {doubt}" for doubt in layout.doubts]
+    if found.doubts:
+        lines.append("(see the picture; try --pitch-px, --pupil)")
+    if isinstance(found, FoundLayout):
+        lines += _left_out(found, layout)
+    elif is_quad_cell(layout):
+        lines.append(
+            "quad cells: the settings are the difference of halves over the flux, and no estimator improves "
+            "it; its centroid gain follows the size of the spot "
+            "(faintspot.slopes.training.measure_centroid_gain)"
         )
-    if again := int(np.count_nonzero(repeated & ~unlike)):
-        notes.append(f"  {again} of {count} frames left out: repeated, the same as the one before")
-    if np.isnan(mean).all():
-        raise InputError(f"{source.description}: expected a frame with spots, every pixel is NaN or infinite")
-    dark, electrons_per_adu = calibration.maps(source.shape)
-    electrons: NDArray[np.float64] = (mean - dark) * electrons_per_adu
-    chosen = np.flatnonzero(usual)[:_FIRST_FRAMES]
-    first = source.block(int(chosen[0]), int(chosen[-1]) + 1)[chosen - chosen[0]]
-    return electrons, first, seen.saturation_adu, notes
+        if first.calibration.dark is None:
+            lines.append("the dark level is not known: slopes are too small where it is not 0; give --dark")
+    estimator, reach = settings.estimator, settings.search_range_px
+    within = "" if reach is None else f", slopes within {np.max(reach):g} px"
+    lines.append(f"background noise {plain(seen.noise)} {unit}, flux of a spot {plain(seen.flux)} {unit}")
+    lines.append(f"{estimator.name}: {estimator.in_words(len(layout), layout.pixels)}{within}")
+    return lines + _limits(seen)
+
+
+def _left_out(found: FoundLayout, layout: Layout) -> list[str]:
+    """Describe spots that are in no window, or far from their lattice or window."""
+    lines = []
+    if len(found.cut):
+        lines.append(
+            f"{len(found.cut)} lit lenslets at the frame's edge left out, their windows do not fit; smaller "
+            "windows (--pixels) or --move-windows take more"
+        )
+    if len(found.outside):
+        lines.append(
+            f"lit spots outside all windows: {len(found.outside)}, see the circles in the picture; a smaller "
+            "--illuminated-fraction takes dim lenslets"
+        )
+    if (drift := np.linalg.norm(found.lenslets.drifts, axis=1).max()) > 0:
+        lines.append(
+            f"the windows follow spots that lie up to {drift:.1f} px from the regular lattice, which stays "
+            "the reference"
+        )
+    if layout.fitted:
+        lines.append(reference_in_words(layout.fitted))
+    moved = np.abs(np.median(layout.offsets, axis=0))
+    if moved.max() > layout.bin:
+        lines.append(
+            f"windows moved off the spots by ({moved[0]:.1f}, {moved[1]:.1f}) px: "
+            "centres of gravity are worse in them"
+        )
+    return lines
+
+
+def _limits(seen: FirstSettings) -> list[str]:
+    """Describe what the settings do not reach."""
+    lines = []
+    if seen.response < 1:
+        lines.append(
+            f"the flux of single frames is too low for full slopes: they show {seen.response:.2f} of the "
+            "displacements; `faintspot tune --recording` says what is possible"
+        )
+    if math.isfinite(seen.systematic_px or math.inf):
+        lines.append(
+            f"S-curve: systematic errors up to {seen.systematic_px:.3f} px wherever a spot of "
+            f"{seen.fwhm_px:.2g} px lies in its pixels, in simulations of Gaussian spots"
+        )
+    if seen.at_edge_px > _LARGE_PX:
+        lines.append(
+            "spots overlap: where neighbours are missing, slopes are off by up to "
+            f"{plain(seen.at_edge_px)} px, the same in all frames; a reference of the same spots takes it off"
+        )
+    return lines
+
+
+def _kept_calibration(calibration: Calibration, given: Mapping[str, object]) -> list[str]:
+    """Return a line on what an existing configuration states and was not given now."""
+    kept = [
+        f"{name} {'map' if is_map(getattr(calibration, name)) else plain(value)}"
+        for name, value in calibration.to_table().items()
+        if given.get(name) is None
+    ]
+    return [f"kept as the configuration states: {', '.join(kept)}"] if kept else []

@@ -311,7 +311,6 @@ def test_lenslets_at_the_edge_are_left_out_or_windows_moved(folder: Path, run: C
     np.save("a.npy", frames()[:, :, 10:])
     result = run.ok("layout", "a.npy", "-o", "new.toml")
     assert "7 lit lenslets at the frame's edge left out" in result.out
-    assert "7 at small x;" in result.out
     assert len(Layout.load("new.toml")) == 42
     assert np.abs(Layout.load("new.toml").offsets).max() < 1.1
     result = run.ok("layout", "a.npy", "-o", "moved.toml", "--move-windows")

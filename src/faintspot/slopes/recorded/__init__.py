@@ -1,4 +1,4 @@
-"""Recorded frames: slopes from files to a file (`measuring`), and the page that shows them."""
+"""Recorded frames: a configuration (`first_layout`), slopes in a file (`measuring`), and their page."""
 
 from __future__ import annotations
 

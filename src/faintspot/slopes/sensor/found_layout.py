@@ -20,6 +20,7 @@ from faintspot.slopes.sensor.window_checks import LARGEST_WINDOW, SMALLEST_WINDO
 from faintspot.slopes.sensor.windows import find_windows
 
 _GHOST = 0.3  # of the median flux of the neighbours
+_MOST_NAMED = 12  # sub-apertures in a doubt
 _EDGE_GHOST = 0.2  # of that of the neighbours at the edge of the pupil, where lenslets may be partly lit
 
 
@@ -56,6 +57,21 @@ class FoundLayout:
         return replace(
             self, layout=self.layout[chosen], clipped=self.clipped[chosen], unlike=self.unlike[chosen]
         )
+
+    @property
+    def doubts(self) -> tuple[str, ...]:
+        """What may be wrong with the layout, one sentence each."""
+        doubts = [self.lenslets.doubt] if self.lenslets.doubt else []
+        for reason, doubtful in (
+            ("at their window's edge, which cuts them", self.clipped),
+            ("displaced unlike those of all neighbours, or far dimmer", self.unlike),
+        ):
+            if doubtful.any():
+                numbers = np.flatnonzero(doubtful)
+                more = ", ..." if len(numbers) > _MOST_NAMED else ""
+                named = ", ".join(map(str, numbers[:_MOST_NAMED])) + more
+                doubts.append(f"slopes of {named} ({len(numbers)}): spots {reason}")
+        return tuple(doubts)
 
     def magnified(self, factor: int, frame_shape: tuple[int, int]) -> FoundLayout:
         """Return what was found in a binned frame in the pixels of the camera, of frames of `frame_shape`."""
@@ -151,6 +167,15 @@ class KnownGrid:
     layout: Layout
     unlit: NDArray[np.float64]
     doubt: str
+
+    def __getitem__(self, chosen: NDArray[np.bool_]) -> KnownGrid:
+        """Return the result for the chosen (n_subapertures,) sub-apertures only."""
+        return replace(self, layout=self.layout[chosen])
+
+    @property
+    def doubts(self) -> tuple[str, ...]:
+        """The doubt, if there is one."""
+        return (self.doubt,) if self.doubt else ()
 
     def magnified(self, factor: int, frame_shape: tuple[int, int]) -> KnownGrid:
         """Return the grid of a binned frame in the pixels of the camera, of frames of `frame_shape`."""

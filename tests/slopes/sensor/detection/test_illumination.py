@@ -198,26 +198,6 @@ def test_region_of_interest() -> None:
     assert max(first.wrong(grid)) <= 1
 
 
-@pytest.mark.parametrize(
-    ("words", "options"),
-    [
-        ("illuminated_fraction = 2", {"illuminated_fraction": 2}),
-        ("pupil: expected x, y, radius", {"pupil": (1, 2)}),
-        ("pupil: expected radius > inner radius", {"pupil": (50, 50, 10, 20)}),
-        ("pupil", {"pupil": "round"}),
-        ("roi: expected x0, y0, x1, y1", {"roi": (1, 2, 3)}),
-        ("roi = 10, 0, 5, 20: expected x0 < x1", {"roi": (10, 0, 5, 20)}),
-        ("within the frame's 60 columns and 50 rows", {"roi": (0, 0, 61, 50)}),
-        ("roi = 0.5", {"roi": (0.5, 0, 10, 10)}),
-        ("pitch_px = 2: expected 4 to", {"pitch_px": 2}),
-        ("pitch_px = 40: expected at most 31.25", {"pitch_px": 40}),
-    ],
-)
-def test_illumination_refuses_wrong_options(words: str, options: dict[str, Any]) -> None:
-    with refused(words):
-        find_lenslets(np.eye(50, 60), **options)
-
-
 def _beam(factor: float, cut: float = np.inf) -> tuple[Sensor, NDArray[np.bool_]]:
     """Return a Gaussian beam that falls by a factor at the radius, dark beyond a cut, and its clear spots."""
     truth = Sensor(7, lenslets=14, inner=0.0, scatter=0.0, outside=1.0)
