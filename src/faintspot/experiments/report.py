@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from faintspot.base.errors import InputError
 from faintspot.base.files import derived
@@ -26,25 +25,14 @@ from faintspot.experiments.paper.figures import (
     sweep_figure,
     triple_picture,
 )
-from faintspot.experiments.study.curves import StudyConditions
 from faintspot.experiments.study.specification import BEST, CORRECTED, StudySpecification
 from faintspot.experiments.study.sweep import PARAMETERS
-from faintspot.slopes.estimators.built_in.maximum_likelihood import MaximumAPosteriori, MaximumLikelihood
-from faintspot.slopes.estimators.built_in.weighted import Weighted
 from faintspot.slopes.spots.shapes import FWHM_OF_SIZE_1_PX
 
 if TYPE_CHECKING:
     import xarray
 
 
-Floats = NDArray[np.float64]
-
-ENOUGH_PHOTONS = {0.1: 30.0, 3.0: 120.0, 16.0: 500.0}
-"""Fewest electrons, by read noise, at which an estimator that knows the spot is expected at the bound."""
-EXPECTED_EFFICIENCY = {MaximumLikelihood.name: 0.95, MaximumAPosteriori.name: 0.95, Weighted.name: 0.75}
-"""Least photon efficiency, by method, where there is flux enough."""
-NEAR_BEST = 1.04
-"""Gain-corrected rms over the smallest of all methods up to which a method counts as near the best."""
 _KINDS = ("error", "photon_efficiency", "gain")
 _ROW_HEIGHT = 4.4
 _FEWEST_POINTS = 3
@@ -148,74 +136,6 @@ def _panel(cells: xarray.Dataset, kind: str, axis: str, title: str) -> Panel:
         lines.append(Line("best", x, best, style={**_BEST_OF_CELL, "zorder": 4}, in_legend=False))
         scale["y_range"] = (0.85 * best.min(), min(4.0, 1.2 * float(np.nanmax(values))))
     return Panel(lines, y=_TEXT[f"estimator_axes.{kind}"], title=title, **scale)
-
-
-def enough_photons(read_noise_e: float, flux_e: float) -> bool:
-    """Whether there is flux enough for the bound to be within reach.
-
-    Between the read noises of `ENOUGH_PHOTONS`, logarithms are interpolated.
-    """
-    noises, fluxes = np.log(list(ENOUGH_PHOTONS)), np.log(list(ENOUGH_PHOTONS.values()))
-    needed = np.exp(np.interp(np.log(max(read_noise_e, 1e-3)), noises, fluxes))
-    return bool(flux_e >= needed * (1 - 1e-9))
-
-
-def findings(dataset: xarray.Dataset) -> list[str]:
-    """Return what a study says about the estimators, a sentence or two each."""
-    return [
-        *_efficient(_finished(dataset, speckled=False)),
-        *_near_the_best(_finished(dataset, speckled=True)),
-    ]
-
-
-def _finished(dataset: xarray.Dataset, *, speckled: bool) -> xarray.Dataset:
-    """Return the finished cells of a study, with or without speckles."""
-    done = dataset["done"].values & ((dataset["d_over_r0"].values > 0) == speckled)
-    return dataset.isel(cell=np.flatnonzero(done)).transpose("cell", "estimator", ...)
-
-
-def _methods(cells: xarray.Dataset) -> list[str]:
-    return [str(method) for method in cells["estimator"].values]
-
-
-def _cells_in_words(cells: xarray.Dataset) -> list[str]:
-    """Return each cell in one line."""
-    names = StudyConditions.__dataclass_fields__
-    columns = [cells[name].values.tolist() for name in names]
-    keys = [StudyConditions(**dict(zip(names, values, strict=True))) for values in zip(*columns, strict=True)]
-    fluxes = cells["flux_e"].values
-    return [f"{flux:g} e-, {key.in_words()}" for flux, key in zip(fluxes, keys, strict=True)]
-
-
-def _efficient(cells: xarray.Dataset) -> list[str]:
-    conditions = zip(cells["read_noise_e"].values, cells["flux_e"].values, strict=True)
-    enough = [enough_photons(float(noise), float(flux)) for noise, flux in conditions]
-    bright = cells.isel(cell=np.flatnonzero(enough))
-    sentences = []
-    for method, target in EXPECTED_EFFICIENCY.items():
-        if method in _methods(cells) and any(enough):
-            efficiency = bright["photon_efficiency"].sel(mode=BEST, estimator=method).values
-            lowest = int(np.argmin(efficiency))
-            values = {"lowest": efficiency[lowest], "where": _cells_in_words(bright)[lowest]}
-            counts = {"reached": np.sum(efficiency >= target), "cells": len(efficiency)}
-            sentences.append(_TEXT("findings.efficient", method=method, target=target, **counts, **values))
-    return sentences
-
-
-def _near_the_best(cells: xarray.Dataset) -> list[str]:
-    if not cells.sizes["cell"]:
-        return []
-    rms: Floats = cells["corrected_rms"].sel(mode=_corrected_mode(cells)).values
-    every, d_over_r0 = rms / np.nanmin(rms, axis=1, keepdims=True), cells["d_over_r0"].values
-    sentences = []
-    for words, part in (("d/r0 up to 1", d_over_r0 <= 1), ("above 1", d_over_r0 > 1)):
-        if part.any():
-            near, worst = (every[part] <= NEAR_BEST).sum(axis=0), 100 * (every[part].max(axis=0) - 1)
-            ranked = sorted(zip(-near, worst, _methods(cells), strict=True), key=lambda each: each[:2])[:5]
-            listed = ", ".join(f"{name} {-count} (worst {percent:.0f} %)" for count, percent, name in ranked)
-            counts = {"which": words, "cells": part.sum(), "near": 100 * (NEAR_BEST - 1)}
-            sentences.append(_TEXT("findings.near_best", **counts, ranked=listed))
-    return sentences
 
 
 def _corrected_mode(dataset: xarray.Dataset) -> str:
@@ -343,7 +263,6 @@ def _widths_in_words(specification: StudySpecification) -> str:
 
 def _of_estimators(dataset: xarray.Dataset) -> list[Section]:
     return [
-        _TEXT.section("sections.findings", findings(dataset)),
         *_figure_sections(dataset),
         claims.baselines_section(dataset),
     ]

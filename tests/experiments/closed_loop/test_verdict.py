@@ -11,13 +11,11 @@ from faintspot.experiments.closed_loop.magnitude import save_recommended
 from faintspot.experiments.closed_loop.results import MagnitudeResult
 from faintspot.experiments.closed_loop.verdict import (
     NOWHERE,
-    better_and_worse,
     equal_methods,
     loop_page,
     loop_summary,
     loop_verdict,
     loop_warnings,
-    options_that_may_pay,
     reference_methods,
     tv_method,
 )
@@ -45,19 +43,14 @@ def test_methods_are_found_by_their_names() -> None:
     method = tv_method(result)
     assert method is not None
     assert LABELS[method] == "TV denoising"
-    assert options_that_may_pay(result) == [("weighted reconstructor", 3, 2)]
-    above, below = better_and_worse(result, 2, 0)
-    assert above
-    assert not below
 
 
-def test_gains_are_said_against_the_strongest_baseline_first() -> None:
+def test_gains_are_stated_against_the_strongest_baseline() -> None:
     result = dataclasses.replace(made_up_magnitude(), names=("brightest", "tv", "window", "ml"))
     assert reference_methods(result) == [2, 0]
     lines = [line for line in loop_verdict(result) if line.startswith("Magnitudes")]
     against = [line.split(" against ")[1].split(":")[0] for line in lines]
-    window, brightest = result.labels[2], result.labels[0]
-    assert against == [window, window, window, brightest, brightest]
+    assert against == 3 * [result.labels[2]]
 
 
 @pytest.fixture

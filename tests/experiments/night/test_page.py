@@ -28,8 +28,8 @@ def test_store_summary_and_page(tmp_path: Path) -> None:
     summary = json.loads((tmp_path / "night.json").read_text(encoding="utf-8"), parse_constant=refuse)
     found = differences(night)[0]
     of_all = summary["differences"][0]
-    assert of_all["at_equal_r0"]["value"] == pytest.approx(found.measured.value, rel=1e-5)
-    assert of_all["in_the_same_turbulence"]["value"] == pytest.approx(0.2, abs=0.05)
+    assert of_all["measured"]["value"] == pytest.approx(found.measured.value, rel=1e-5)
+    assert of_all["paired"]["value"] == pytest.approx(0.2, abs=0.05)
     assert summary["verdicts"][0]["outcome"] == "holds"
     html = (tmp_path / "night.html").read_text(encoding="utf-8")
     sections = re.findall(r'<section id="([^"]+)"', html)
@@ -48,7 +48,7 @@ def test_what_is_not_known_is_null() -> None:
     summary = night_summary(night)
     json.dumps(summary, allow_nan=False)
     assert summary["against_r0"] == []
-    assert summary["differences"][0]["in_the_same_turbulence"] is None
+    assert summary["differences"][0]["paired"] is None
 
 
 def test_the_text_has_a_line_for_each_verdict_and_difference() -> None:

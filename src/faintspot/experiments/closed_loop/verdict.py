@@ -22,7 +22,7 @@ from faintspot.experiments.closed_loop.results import (
 from faintspot.experiments.methods import Knowledge
 from faintspot.loop.control.base import INTEGRATOR, split_control
 from faintspot.loop.simulation.configuration import LoopConfiguration
-from faintspot.loop.simulation.methods import VARIANTS, Method
+from faintspot.loop.simulation.methods import Method
 from faintspot.slopes.estimators.base import Style
 from faintspot.slopes.estimators.built_in.gravity import BrightestPixels
 from faintspot.slopes.estimators.built_in.total_variation import TotalVariation
@@ -81,7 +81,7 @@ NOWHERE = "TV raises the Strehl ratio nowhere beyond its error"
 
 def loop_verdict(result: MagnitudeResult) -> list[str]:
     """Return what the results say about TV, and then about the other ways to measure slopes."""
-    lines = [*_recommendations(result), *_magnitude_lines(result)]
+    lines = [*_recommendations(result), *_comparisons(result)]
     # What the denoising itself does: against the same without it.
     tv, reference = tv_method(result), reference_methods(result)[-1]
     if tv is None or tv == reference:
@@ -148,35 +148,6 @@ def tv_method(result: MagnitudeResult) -> int | None:
     return result.names.index(TotalVariation.name) if TotalVariation.name in result.names else None
 
 
-def options_that_may_pay(result: MagnitudeResult) -> list[tuple[str, int, int]]:
-    """Return the options that methods differ by, the method with it and the one without, for `VARIANTS`."""
-    names = result.names
-    return [
-        (label, method, names.index(name.replace(f"+{variant}", "")))
-        for variant, label in VARIANTS.items()
-        for method, name in enumerate(names)
-        if f"+{variant}" in name and name.replace(f"+{variant}", "") in names
-    ]
-
-
-def better_and_worse(result: MagnitudeResult, method: int, reference: int) -> tuple[str, str]:
-    """Return at which fluxes a method's Strehl is above and below another's beyond its error, in words.
-
-    "" for none.
-    """
-    decided = [difference.decided for difference in differences_by_flux(result, method, reference)]
-
-    def words(outcome: int) -> str:
-        if decided == [outcome] * len(decided):
-            return "all fluxes"
-        fluxes = [
-            f"{flux:.3g}" for flux, sign in zip(result.photons, decided, strict=True) if sign == outcome
-        ]
-        return f"{', '.join(fluxes)} photo-electrons" if fluxes else ""
-
-    return words(1), words(-1)
-
-
 def _headline(comparisons: list[Estimate]) -> str:
     finite = [comparison for comparison in comparisons if np.isfinite(comparison.low)]
     if not finite:
@@ -193,23 +164,28 @@ def _headline(comparisons: list[Estimate]) -> str:
     )
 
 
-def _magnitude_lines(result: MagnitudeResult) -> list[str]:
-    references, lines = reference_methods(result), []
-    for rank, reference in enumerate(references):
-        compared = [method for method in range(len(result.labels)) if method not in references[: rank + 1]]
-        lines += [_comparison(result, method, reference) for method in compared]
-    for option, method, without in options_that_may_pay(result):
-        above, below = better_and_worse(result, method, without)
-        verdict = f"pays at {above}" if above else "pays nowhere beyond its error"
-        verdict += f", costs at {below}" if below else ""
-        lines.append(f"{result.labels[method]} against {result.labels[without]}: {option} {verdict}.")
-    return lines
+def _comparisons(result: MagnitudeResult) -> list[str]:
+    """Return each method's differences from the strongest baseline."""
+    reference = reference_methods(result)[0]
+    return [
+        _comparison(result, method, reference) for method in range(len(result.labels)) if method != reference
+    ]
 
 
 def _comparison(result: MagnitudeResult, method: int, reference: int) -> str:
-    above, below = better_and_worse(result, method, reference)
-    parts = [f"more Strehl beyond its error at {above}"] if above else []
-    parts += [f"less Strehl beyond its error at {below}"] if below else []
+    decided = [difference.decided for difference in differences_by_flux(result, method, reference)]
+
+    def fluxes(outcome: int) -> str:
+        if decided == [outcome] * len(decided):
+            return "all fluxes"
+        pairs = zip(result.photons, decided, strict=True)
+        return ", ".join(f"{flux:.3g} e-" for flux, sign in pairs if sign == outcome)
+
+    parts = [
+        f"{word} Strehl beyond its error at {where}"
+        for word, where in (("more", fluxes(1)), ("less", fluxes(-1)))
+        if where
+    ]
     verdict = "; ".join(parts) if parts else "no difference beyond its error at any flux"
     gain = _gain_in_magnitude(result, method, reference)
     return f"Magnitudes, {result.labels[method]} against {result.labels[reference]}: {verdict}{gain}."

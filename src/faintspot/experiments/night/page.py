@@ -170,7 +170,7 @@ def _of_strengths(
 
 
 SUMMARY_FILE, PAGE_FILE = "night.json", "night.html"
-# Attributes in JSON, and the names of those that have another one there.
+# Attributes in JSON.
 _MEAN = ("mean", "standard_deviation", "blocks")
 _DIFFERENCE = (
     "name",
@@ -182,10 +182,8 @@ _DIFFERENCE = (
     "hours_needed",
     "is_long_enough",
 )
-_DIFFERENCE_NAMES = {"name": "method", "measured": "at_equal_r0", "paired": "in_the_same_turbulence"}
 _LINE = ("name", "slope_per_m", "intercept", "correlation", "blocks")
 _VERDICT = ("statement", "outcome", "measured", "significance", "paired", "paired_outcome", "hours_needed")
-_VERDICT_NAMES = {"paired": "in_the_same_turbulence", "paired_outcome": "outcome_in_the_same_turbulence"}
 
 
 def write_night(night: Night, folder: str | Path) -> list[Path]:
@@ -224,13 +222,13 @@ def night_summary(night: Night) -> dict[str, Any]:
             ]
             for name, rows in _compared(night).items()
         },
-        "differences": [_plain_record(each, _DIFFERENCE, _DIFFERENCE_NAMES) for each in differences(night)],
+        "differences": [plain_record(each, _DIFFERENCE) for each in differences(night)],
         "by_strength": [
-            {"mean_strength": plain(strength), **_plain_record(each, _DIFFERENCE, _DIFFERENCE_NAMES)}
+            {"mean_strength": plain(strength), **plain_record(each, _DIFFERENCE)}
             for strength, each in by_strength(night)
         ],
-        "against_r0": [_plain_record(line, _LINE, _DIFFERENCE_NAMES) for line in lines(night)],
-        "verdicts": [_plain_record(each, _VERDICT, _VERDICT_NAMES) for each in verdicts(night)],
+        "against_r0": [plain_record(line, _LINE) for line in lines(night)],
+        "verdicts": [plain_record(each, _VERDICT) for each in verdicts(night)],
         "paper": paper_sentences(night),
     }
 
@@ -238,10 +236,17 @@ def night_summary(night: Night) -> dict[str, Any]:
 def plain(value: object) -> Any:
     """Return a value for JSON: numbers to six digits, estimates with their intervals; None is not known."""
     if isinstance(value, Estimate):
-        return _plain_estimate(value)
+        if not math.isfinite(value.value):
+            return None
+        return {**plain_record(value, ("value", "standard_error", "low", "high")), "pieces": value.count}
     if isinstance(value, float):
         return float(f"{value:.6g}") if math.isfinite(value) else None
     return None if value == "" else value
+
+
+def plain_record(record: object, attributes: Sequence[str]) -> dict[str, Any]:
+    """Return attributes of an object as values for JSON."""
+    return {name: plain(getattr(record, name)) for name in attributes}
 
 
 def night_summary_text(night: Night) -> str:
@@ -373,14 +378,3 @@ def _facts(night: Night) -> Mapping[str, str]:
         how="the simulation’s" if is_simulated else "measured",
         um=night.wavelength_m * 1e6,
     )
-
-
-def _plain_record(record: object, attributes: Sequence[str], names: Mapping[str, str]) -> dict[str, Any]:
-    return {names.get(name, name): plain(getattr(record, name)) for name in attributes}
-
-
-def _plain_estimate(estimate: Estimate) -> dict[str, Any] | None:
-    if not math.isfinite(estimate.value):
-        return None
-    numbers = {name: plain(getattr(estimate, name)) for name in ("value", "standard_error", "low", "high")}
-    return {**numbers, "pieces": estimate.count}

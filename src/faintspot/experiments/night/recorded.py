@@ -16,7 +16,13 @@ from faintspot.base.report.page import Report, Section
 from faintspot.base.report.texts import Texts
 from faintspot.base.statistics import Estimate
 from faintspot.experiments.night.analysis import Difference, differences
-from faintspot.experiments.night.page import night_page, night_summary, night_summary_text, plain
+from faintspot.experiments.night.page import (
+    night_page,
+    night_summary,
+    night_summary_text,
+    plain,
+    plain_record,
+)
 from faintspot.experiments.night.protocol import Night
 from faintspot.experiments.night.recorded_methods import MeasuredStrehl, RecordedMethods, conditions_of
 from faintspot.experiments.night.simulated import r0_of_slopes
@@ -336,18 +342,10 @@ def page_of_recording(recorded: RecordedNight) -> Report:
 def summary_of_recording(recorded: RecordedNight) -> dict[str, object]:
     """Return the numbers of the page as plain values for JSON; null is not known."""
     night, gains = recorded.night, recorded.gains
-    parts = ("standard_error", "low", "high")
     return {
         **night_summary(night),
         "strehl": "measured" if recorded.is_measured else "estimated from slopes",
-        "phase_rad2": [
-            {
-                "method": each.name,
-                "difference": plain(each.measured.value),
-                **{part: plain(getattr(each.measured, part)) for part in parts},
-            }
-            for each in phase_differences(recorded)
-        ],
+        "phase_rad2": [plain_record(each, ("name", "measured")) for each in phase_differences(recorded)],
         "centroid_gain_of_control": recorded.centroid_gain,
         "relative_centroid_gain": {
             label: {"value": plain(gain), "standard_error": plain(error)}
