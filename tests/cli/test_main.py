@@ -97,7 +97,6 @@ def test_help_is_in_sections_with_defaults(run: Commands) -> None:
     ]
     assert places == sorted(places)
     assert "[default: 0.9]" in text
-    assert "at least 0]" in run.ok("loop", "magnitude", "--help").out
     assert "INTEGER" not in text + run.ok("realtime", "run", "--help").out
 
 

@@ -182,38 +182,27 @@ def import_modules(package: str) -> list[str]:
     return [import_module(module.name).__name__ for module in found if not module.ispkg]
 
 
-def load_filelock() -> Any:
-    """Return the package filelock."""
-    return _load("filelock", "filelock", "Writing slopes that can be resumed")
+_FILE_PACKAGES = {
+    "astropy.io.fits": ("astropy", "Reading or writing a FITS file"),
+    "filelock": ("filelock", "Writing slopes that can be resumed"),
+    "h5py": ("h5py", "Reading an HDF5 or MATLAB 7.3 file"),
+    "PIL.Image": ("pillow", "Reading a PNG, BMP, JPEG or compressed TIFF file"),
+    "tifffile": ("tifffile", "Reading a TIFF file"),
+    "zarr": ("zarr", "Reading or writing a Zarr store"),
+}
+"""Package and purpose of each module of the extra `io`."""
 
 
-def load_fits() -> Any:
-    """Return the package astropy.io.fits."""
-    return _load("astropy.io.fits", "astropy", "Reading or writing a FITS file")
+def load_package(module: str) -> Any:
+    """Import a module of the extra `io`.
 
-
-def load_hdf5() -> Any:
-    """Return the package h5py."""
-    return _load("h5py", "h5py", "Reading an HDF5 or MATLAB 7.3 file")
-
-
-def load_pillow() -> Any:
-    """Return the module PIL.Image."""
-    return _load("PIL.Image", "pillow", "Reading a PNG, BMP, JPEG or compressed TIFF file")
-
-
-def load_tifffile() -> Any:
-    """Return the package tifffile."""
-    return _load("tifffile", "tifffile", "Reading a TIFF file")
-
-
-def load_zarr() -> Any:
-    """Return the package zarr."""
-    return _load("zarr", "zarr", "Reading or writing a Zarr store")
-
-
-def _load(module: str, package: str, purpose: str) -> Any:
+    Raises
+    ------
+    MissingExtraError
+        If its package is not installed.
+    """
     try:
         return import_module(module)
     except ImportError:
+        package, purpose = _FILE_PACKAGES[module]
         raise MissingExtraError(package, "io", purpose) from None

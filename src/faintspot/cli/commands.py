@@ -25,12 +25,10 @@ class _Option(click.Option):
         self.section = section
 
     def get_help_extra(self, context: click.Context) -> Any:
-        """Return default and range, in words."""
+        """Return default and range; a default in words has no brackets of its own."""
         extra = super().get_help_extra(context)
         if isinstance(self.show_default, str):
             extra["default"] = self.show_default
-        if "range" in extra:
-            extra["range"] = _range_in_words(self.type)
         return extra
 
 
@@ -93,14 +91,6 @@ class SectionedCommand(click.Command):
         for heading, records in sections.items():
             with formatter.section(heading):
                 formatter.write_dl(records)
-
-
-def _range_in_words(kind: Any) -> str:
-    if None not in (kind.min, kind.max) and not (kind.min_open or kind.max_open):
-        return f"{kind.min:g} to {kind.max:g}"
-    least = None if kind.min is None else f"{'above' if kind.min_open else 'at least'} {kind.min:g}"
-    most = None if kind.max is None else f"{'below' if kind.max_open else 'at most'} {kind.max:g}"
-    return ", ".join(part for part in (least, most) if part)
 
 
 def option(*names: str, **attributes: object) -> Decorator:
@@ -177,15 +167,12 @@ def declared(
     return add
 
 
-Option = Callable[[Callable[..., Any]], Callable[..., Any]]
-
-
-def configuration_option(what: str) -> Option:
+def configuration_option(what: str) -> Decorator:
     """Return --config: a configuration, and what it is to the command."""
     return option("-c", "--config", default="faintspot.toml", metavar="TOML", help=what)
 
 
-def name_option(what: str) -> Option:
+def name_option(what: str) -> Decorator:
     """Return --name: what has it."""
     return option("--name", default="faintspot", help=what)
 
@@ -193,7 +180,7 @@ def name_option(what: str) -> Option:
 ENGINE_NAME = name_option("Name of the engine.")
 
 
-def which_frames(**options: object) -> Option:
+def which_frames(**options: object) -> Decorator:
     """Return --key and --time-axis: which array of a file holds frames, and how."""
     key = option("--key", metavar="NAME", help="Which array to read of files that hold several.", **options)
     time_axis = option(

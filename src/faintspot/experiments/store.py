@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base import __version__
-from faintspot.base.errors import InputError, load_zarr
+from faintspot.base.errors import InputError, load_package
 from faintspot.base.files import output_errors
 from faintspot.io.stored_array import one_line
 from faintspot.io.zarr_store import stored_attributes
@@ -91,7 +91,7 @@ class ZarrStore:
         self.path = Path(path)
         own = {**(attributes or {}), _FORMAT: FORMAT, _KIND: kind, _FINGERPRINT: fingerprint}
         _check_path(self.path, own, overwrite=overwrite)
-        zarr = load_zarr()
+        zarr = load_package("zarr")
         with output_errors(self.path):
             if overwrite and self.path.exists():
                 shutil.rmtree(self.path)

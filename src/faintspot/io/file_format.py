@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -199,12 +199,18 @@ class FileFormat:
     All programs load all formats, so a format imports its optional packages where it uses them.
     """
 
+    kinds: ClassVar[list[type["FileFormat"]]] = []
+    """All formats, in the order of their definition; those whose name begins with _ are bases of others."""
     name: str
     """Name for messages."""
     signatures: tuple[bytes, ...] = ()
     """First bytes of a file of frames, up to 8; empty if frames are not supported."""
     endings: tuple[str, ...] = ()
     """Endings of files of slopes; empty if slopes are not supported."""
+
+    def __init_subclass__(cls) -> None:
+        if not cls.__name__.startswith("_"):
+            FileFormat.kinds.append(cls)
 
     def has_frames(self, path: Path, start: bytes) -> bool:
         """Return whether a path is of this format; `start` holds a file's first bytes (b"" for a folder)."""

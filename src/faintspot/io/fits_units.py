@@ -5,7 +5,6 @@ from __future__ import annotations
 import gzip
 import io
 import math
-import re
 import warnings
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -16,7 +15,7 @@ from typing import IO, Any, NamedTuple, cast
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from faintspot.base.errors import InputError, MissingExtraError, load_fits
+from faintspot.base.errors import InputError, MissingExtraError, load_package
 from faintspot.base.files import check_bytes, check_regular, write_atomically
 from faintspot.io.stored_array import MOST_WHOLE_BYTES, one_line
 from faintspot.io.zarr_store import check_inflated, is_surely_small
@@ -146,7 +145,9 @@ class HeaderDataUnit:
         itemsize = abs(int(self.header["ZBITPIX"])) // 8
         check_bytes(name, math.prod(self.tile or ()) * itemsize, MOST_WHOLE_BYTES, "a chunk")
         with open_plain_or_gzip(path) as stream:
-            opened = load_fits().open(stream, memmap=False, disable_image_compression=True)
+            opened = load_package("astropy.io.fits").open(
+                stream, memmap=False, disable_image_compression=True
+            )
             rows = np.asarray(opened[self.index].data)
             heap = self.data_start + int(self.header.get("THEAP", rows.nbytes))
             for column in {"COMPRESSED_DATA", "GZIP_COMPRESSED_DATA"} & set(rows.dtype.names or ()):
@@ -190,7 +191,7 @@ def write_images(
     MissingExtraError
         When astropy is not installed.
     """
-    fits, stream = load_fits(), io.BytesIO()
+    fits, stream = load_package("astropy.io.fits"), io.BytesIO()
     primary = fits.PrimaryHDU()
     primary.header["CREATOR"] = "faintspot"
     hdus = [primary]
@@ -204,7 +205,7 @@ def write_images(
 
 def units_of(path: Path) -> Iterator[HeaderDataUnit]:
     """Yield the file's header-and-data units in order, skipping over the data."""
-    header_type = load_fits().Header
+    header_type = load_package("astropy.io.fits").Header
     with open_plain_or_gzip(path) as stream:
         next_unit, index = 0, 0
         while True:
@@ -233,9 +234,8 @@ def is_aot(path: str | Path) -> bool:
         return False
 
 
-_FORMAT = re.compile(r"(\d*)([LXBIJKAEDCMPQ])")
-_BYTES = {"L": 1, "A": 1, "C": 8, "M": 16, "P": 8, "Q": 16}
-_NUMBERS = {"B": "u1", "I": ">i2", "J": ">i4", "K": ">i8", "E": ">f4", "D": ">f8"}
+_NUMBERS = "BIJKED"
+"""Letters of the formats of columns of numbers."""
 
 
 class Column(NamedTuple):
@@ -273,34 +273,22 @@ def columns_of(unit: HeaderDataUnit) -> dict[str, Column]:
     ValueError
         When the header is damaged.
     """
-    header, columns, offset = unit.header, {}, 0
+    header, columns = unit.header, {}
     row_bytes, count = int(header["NAXIS1"]), int(header["NAXIS2"])
     check_bytes(unit.name, row_bytes, MOST_WHOLE_BYTES, "a row")
-    for number in range(1, int(header["TFIELDS"]) + 1):
-        described = _FORMAT.match(str(header[f"TFORM{number}"]).strip())
-        if described is None:
-            raise ValueError(f"TFORM{number} is not known")
-        repeat, code = int(described[1] or 1), described[2]
-        name = str(header.get(f"TTYPE{number}", f"COLUMN{number}")).strip()
-        if code in _NUMBERS and repeat:
-            sides = re.findall(r"\d+", str(header.get(f"TDIM{number}", "")))
-            shape = tuple(map(int, reversed(sides)))
-            if not shape or math.prod(shape) != repeat:
-                shape = (repeat,) if repeat > 1 else ()
-            row: Any = {"names": ["values"], "formats": [(_NUMBERS[code], shape)], "offsets": [offset]}
-            row["itemsize"] = row_bytes
-            keys = {"BSCALE": "TSCAL", "BZERO": "TZERO", "BLANK": "TNULL"}
-            cards = {key: header[f"{own}{number}"] for key, own in keys.items() if f"{own}{number}" in header}
-            # NumPy refuses a field that does not fit into the row.
-            columns[name] = Column(name, np.dtype(row), count, cards)
-        offset += -(-repeat // 8) if code == "X" else repeat * _size(code)
-    if offset != row_bytes:
-        raise ValueError(f"its columns have {offset} bytes, NAXIS1 says {row_bytes}")
+    table = load_package("astropy.io.fits").BinTableHDU.fromstring(header.tostring().encode())
+    stored = table.columns.dtype.newbyteorder(">")
+    if stored.itemsize != row_bytes:
+        raise ValueError(f"its columns have {stored.itemsize} bytes, NAXIS1 says {row_bytes}")
+    for number, column in enumerate(table.columns, 1):
+        kind, offset = stored.fields[column.name][:2]
+        if column.format[-1] not in _NUMBERS or not kind.itemsize:
+            continue
+        row: Any = {"names": ["values"], "formats": [kind], "offsets": [offset], "itemsize": row_bytes}
+        keys = {"BSCALE": "TSCAL", "BZERO": "TZERO", "BLANK": "TNULL"}
+        cards = {key: header[f"{own}{number}"] for key, own in keys.items() if f"{own}{number}" in header}
+        columns[column.name] = Column(column.name, np.dtype(row), count, cards)
     return columns
-
-
-def _size(code: str) -> int:
-    return np.dtype(_NUMBERS[code]).itemsize if code in _NUMBERS else _BYTES[code]
 
 
 class ColumnValues:

@@ -19,15 +19,7 @@ from faintspot.io.stored_array import MOST_WHOLE_BYTES, StoredArray, arranged, o
 import_modules("faintspot.io.formats")
 
 
-def _below(kind: type[FileFormat]) -> Iterator[type[FileFormat]]:
-    for below in kind.__subclasses__():
-        yield below
-        yield from _below(below)
-
-
-FORMATS: tuple[FileFormat, ...] = tuple(
-    kind() for kind in _below(FileFormat) if not kind.__name__.startswith("_")
-)
+FORMATS: tuple[FileFormat, ...] = tuple(kind() for kind in FileFormat.kinds)
 _SIGNATURE_BYTES = 8
 
 

@@ -12,7 +12,7 @@ from typing import IO, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.base.errors import InputError, load_filelock
+from faintspot.base.errors import InputError, load_package
 from faintspot.base.files import Closing, output_errors, replace_file
 from faintspot.base.flags import VARIABLES
 from faintspot.io.file_format import RecordingHeader, StoredSlopes, checked_block
@@ -40,7 +40,7 @@ class OutputLock:
     """
 
     def __init__(self, path: Path) -> None:
-        filelock = load_filelock()
+        filelock = load_package("filelock")
         self._file = path.with_name(f".{path.name}.lock")
         self._lock = filelock.FileLock(self._file, timeout=_PATIENCE_S, fallback_to_soft=False)
         advice = "wait until it has ended"

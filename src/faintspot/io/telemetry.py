@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from faintspot.base.errors import InputError, load_zarr
+from faintspot.base.errors import InputError, load_package
 from faintspot.base.files import check_bytes, memory_bytes
 from faintspot.base.flags import VARIABLES, are_valid
 from faintspot.io.stored_array import one_line
@@ -22,7 +22,7 @@ from faintspot.io.zarr_store import (
     stored_attributes,
 )
 
-zarr = load_zarr()
+zarr = load_package("zarr")
 FRAMES, IMAGES = "finished_frames", "finished_images"
 """Attributes of a store: numbers of complete frames and images."""
 PARTS, CONTROL = "parts", "control"

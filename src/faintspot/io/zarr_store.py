@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.base.errors import InputError, load_zarr
+from faintspot.base.errors import InputError, load_package
 from faintspot.base.files import (
     MOST_TEXT_BYTES,
     check_bytes,
@@ -136,7 +136,7 @@ def open_store(path: Path, key: str = "") -> Any:
     Exception
         On broken metadata zarr raises many kinds of errors.
     """
-    return load_zarr().open(str(path), mode="r", path=key, use_consolidated=False)
+    return load_package("zarr").open(str(path), mode="r", path=key, use_consolidated=False)
 
 
 @contextmanager
@@ -145,7 +145,7 @@ def new_store(path: Path, attributes: Mapping[str, Any]) -> Iterator[Any]:
     hidden = path.with_name(f".{path.name}.new")
     shutil.rmtree(hidden, ignore_errors=True)
     hidden.mkdir()
-    yield load_zarr().create_group(str(hidden), zarr_format=3, attributes=dict(attributes))
+    yield load_package("zarr").create_group(str(hidden), zarr_format=3, attributes=dict(attributes))
     for file in (*hidden.rglob("*"), hidden):
         (sync_folder if file.is_dir() else sync_file)(file)
     hidden.rename(path)
@@ -235,7 +235,7 @@ def replace_attributes(path: Path, changed: Mapping[str, object]) -> None:
 
 def checked_codecs() -> tuple[Any, ...]:
     """Return the codecs for compressed chunks with a checksum."""
-    zarr = load_zarr()
+    zarr = load_package("zarr")
     return zarr.codecs.ZstdCodec(level=0), zarr.codecs.Crc32cCodec()
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.checks import number_between
-from faintspot.base.errors import InputError, load_zarr
+from faintspot.base.errors import InputError, load_package
 from faintspot.base.files import output_errors
 from faintspot.engine.interleaving import methods_after
 from faintspot.engine.readout import StopEvent
@@ -23,7 +23,7 @@ from faintspot.engine.telemetry.ring import Ring, TelemetryRing
 from faintspot.io.telemetry import ARRAYS, CONTROL, FRAMES, IMAGES, PARTS, stored_names
 from faintspot.io.zarr_store import TELEMETRY, checked_codecs, new_store, replace_attributes
 
-zarr = load_zarr()
+zarr = load_package("zarr")
 _CHUNK_NUMBERS, _CHUNK_BYTES = 1 << 16, 1 << 22
 _WRITTEN_ONCE = PARTS, CONTROL
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.checks import number_between
-from faintspot.base.errors import InputError, load_zarr
+from faintspot.base.errors import InputError, load_package
 from faintspot.base.files import output_errors
 from faintspot.base.options import LIST, TEXTS, Options, number, setting
 from faintspot.experiments.closed_loop.results import with_choice
@@ -301,7 +301,7 @@ class Night:
         MissingExtraError
             When zarr is not installed.
         """
-        path, zarr = Path(path), load_zarr()
+        path, zarr = Path(path), load_package("zarr")
         hidden = path.with_name(f".{path.name}.new")
         attributes = {
             item.name: list(value) if isinstance(value, tuple) else value
@@ -334,7 +334,7 @@ def load_night(path: str | Path) -> Night:
     MissingExtraError
         When zarr is not installed.
     """
-    zarr = load_zarr()
+    zarr = load_package("zarr")
     try:
         group = zarr.open_group(str(path), mode="r")
         attributes = dict(group.attrs)

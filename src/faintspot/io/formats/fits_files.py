@@ -14,7 +14,7 @@ from typing import IO, Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.base.errors import InputError, load_fits
+from faintspot.base.errors import InputError, load_package
 from faintspot.base.files import check_bytes
 from faintspot.base.flags import VARIABLES
 from faintspot.base.text_files import parse_json, to_json
@@ -65,14 +65,14 @@ class Fits(FileFormat):
 
     def require(self) -> None:
         """Raise MissingExtraError when astropy is not installed."""
-        load_fits()
+        load_package("astropy.io.fits")
 
     def write(self, stream: IO[bytes], slopes: StoredSlopes) -> None:
         """Write an image extension for each variable and coordinate, and ATTRIBUTES: a JSON text as bytes.
 
         One of them is in memory at a time.
         """
-        fits = load_fits()
+        fits = load_package("astropy.io.fits")
         count, width = slopes.variables["x"].shape
         cards = [
             ("CREATOR", "faintspot"),
@@ -95,7 +95,7 @@ class Fits(FileFormat):
         total = sum(unit.value_bytes for unit in units.values())
         check_bytes(path, total, most_slopes_bytes(), "slopes")
         check_stated(path, {name: units[name].shape for name in VARIABLES if name in units})
-        fits = load_fits()
+        fits = load_package("astropy.io.fits")
         with warnings.catch_warnings(), fits_units.open_plain_or_gzip(path) as stream:
             warnings.simplefilter("error")  # astropy only warns of truncated files and wrong checksums
             with fits.open(stream, memmap=False, checksum=True) as opened:
@@ -183,7 +183,7 @@ def _column(name: str, path: Path, unit: fits_units.HeaderDataUnit, column: fits
 
 def _image(name: str, path: Path, unit: fits_units.HeaderDataUnit) -> StoredArray:
     """Return the image of a unit: of plain bytes, or decompressed tile by tile by astropy."""
-    fits = load_fits()
+    fits = load_package("astropy.io.fits")
     compressed_file = fits_units.is_gzip(path)
     if not compressed_file:
         fits_units.check_present(name, path, unit.data_start + unit.header.data_size)
@@ -248,7 +248,7 @@ class _Image:
 def _write_image(stream: IO[bytes], name: str, values: NDArray[np.generic], units: str, comment: str) -> None:
     """Write one image extension; FITS stores bool as bytes."""
     stored = values.view(np.uint8) if values.dtype == np.bool_ else values
-    fits = load_fits()
+    fits = load_package("astropy.io.fits")
     header = fits.Header([("EXTNAME", name.upper()), ("BUNIT", units), ("COMMENT", comment)])
     _write_unit(stream, fits.ImageHDU(stored.astype(stored.dtype.newbyteorder(">")), header))
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.base.errors import InputError, load_hdf5
+from faintspot.base.errors import InputError, load_package
 from faintspot.base.files import check_file_size
 from faintspot.io.file_format import FileFormat
 from faintspot.io.stored_array import MOST_WHOLE_BYTES, StoredArray, choose_name, one_line
@@ -37,7 +37,7 @@ class Hdf5(FileFormat):
 
     def find(self, path: Path, key: str | None) -> StoredArray:
         """Return the data set at `key`, the one named `frames`, or the only one of 2 or 3 dimensions."""
-        h5py = load_hdf5()
+        h5py = load_package("h5py")
         with h5py.File(path, "r") as file:
             chosen = choose_name(path, _dimensions(h5py, file), None if key is None else key.strip("/"))
             data_set = file[chosen]

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.base.errors import InputError, MissingExtraError, load_pillow, load_tifffile
+from faintspot.base.errors import InputError, MissingExtraError, load_package
 from faintspot.io.file_format import FileFormat
 from faintspot.io.fits_units import StreamedArray, check_present
 from faintspot.io.stored_array import CHANNELS, EQUAL_COLOURS, StoredArray, grey, one_channel
@@ -26,7 +26,7 @@ class _Image(FileFormat):
 
     def find(self, path: Path, key: str | None) -> StoredArray:
         """Return the image, or its channel `key`: red, green or blue."""
-        image = load_pillow()
+        image = load_package("PIL.Image")
         with image.open(path, formats=[self.name]) as opened:
             (width, height), mode, tiles = opened.size, opened.mode, str(getattr(opened, "tile", ""))
         is_colour = mode in _COLOUR
@@ -94,7 +94,7 @@ class Tiff(FileFormat):
         A series in tifffile is a set of pages written together. Raises InputError when pages differ in size
         or type.
         """
-        with _complaints() as complaints, load_tifffile().TiffFile(path) as file:
+        with _complaints() as complaints, load_package("tifffile").TiffFile(path) as file:
             len(file.pages)  # follows all links between pages, and so complains of a circle
             chosen = _choose(path, list(file.series), key)
             name = f"{path}:{key}" if key is not None else str(path)
@@ -161,7 +161,7 @@ def _array(name: str, path: Path, chosen: list[Any], numbers: list[int]) -> Stor
         )
 
     def open_pages(files: ExitStack) -> object:
-        file = files.enter_context(load_tifffile().TiffFile(path))
+        file = files.enter_context(load_package("tifffile").TiffFile(path))
         pages = _Pages(path, [page for number in numbers for page in file.series[number].pages])
         return pages if count > 1 else pages[0:1][0]
 
@@ -187,7 +187,7 @@ class _Pages:
             return np.asarray(page.asarray(maxworkers=1))
         if page.dtype.itemsize > 4:
             raise MissingExtraError("imagecodecs", "io", f"Reading {page.compression.name} of {page.dtype}")
-        with load_pillow().open(self._path, formats=["TIFF"]) as image:
+        with load_package("PIL.Image").open(self._path, formats=["TIFF"]) as image:
             image.seek(page.index)
             return np.asarray(image)
 

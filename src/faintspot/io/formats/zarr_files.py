@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.base.errors import InputError, load_zarr
+from faintspot.base.errors import InputError, load_package
 from faintspot.base.files import sync_file, sync_folder
 from faintspot.base.flags import VARIABLES
 from faintspot.io.file_format import (
@@ -70,7 +70,7 @@ class SlopeStore:
     """
 
     def __init__(self, path: Path, run: RecordingHeader) -> None:
-        zarr = load_zarr()
+        zarr = load_package("zarr")
         self.path, self._n_frames = path, run.n_frames
         self._not_synchronised: set[Path] = set()
         if not path.exists():
@@ -233,7 +233,7 @@ def _create(path: Path, run: RecordingHeader) -> None:
         with warnings.catch_warnings():
             # Consolidated metadata are not yet in the standard of Zarr; xarray warns when they are missing.
             warnings.simplefilter("ignore")
-            load_zarr().consolidate_metadata(group.store)
+            load_package("zarr").consolidate_metadata(group.store)
 
 
 def _stored_attributes(path: Path) -> dict[str, Any]:
@@ -261,7 +261,7 @@ class Zarr(FileFormat):
         """
         if not is_store(path):
             raise InputError(f"{path}: expected a Zarr store or a file of frames, this directory is neither")
-        zarr = load_zarr()
+        zarr = load_package("zarr")
         node: Any = open_store(path, key or "")
         if isinstance(node, zarr.Group):
             arrays = dict(node.arrays())
@@ -273,7 +273,7 @@ class Zarr(FileFormat):
 
     def require(self) -> None:
         """Raise MissingExtraError when zarr is not installed."""
-        load_zarr()
+        load_package("zarr")
 
     def read(self, path: Path) -> StoredSlopes:
         """Read the finished frames of a store."""

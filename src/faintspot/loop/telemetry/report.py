@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
@@ -43,6 +43,7 @@ Floats = NDArray[np.float64]
 
 _TEXT = Texts("faintspot.loop.telemetry")
 _PARTS = ("frames", "loop", "noise", "turbulence", "vibrations", "spectra", "choices")
+_OF_TURBULENCE = _PARTS[3:]
 _TIMES_AT_LIMIT = 3  # that a largest value occurs, to be taken for a limit
 _DRAWS = 1000
 _GAIN_SPREAD = 0.5  # of the deviation of the centroid gain from 1: it differs between spatial scales
@@ -78,6 +79,11 @@ class LoopReport:
     """Delay and centroid gain that were measured and are used."""
     observed: ObservedLoop | None = None
     """From which a controller can be learnt; None if delay or turbulence are unknown."""
+
+    def lack(self, reason: str, names: Sequence[str] = _OF_TURBULENCE) -> None:
+        """State why parts have no values, unless a reason is stated already."""
+        for name in names:
+            self.parts[name].missing = self.parts[name].missing or reason
 
     @property
     def advice(self) -> str:
@@ -177,8 +183,7 @@ def _loop(report: LoopReport) -> LoopDelay:
     if loop.commands is None or loop.interaction_matrix is None:
         absent = "commands" if loop.commands is None else "an interaction or control matrix"
         why = f"The recording has no {absent}: its open-loop slopes are unknown."
-        for name in ("loop", "turbulence", "vibrations", "spectra", "choices"):
-            report.parts[name].missing = why
+        report.lack(why, ("loop", *_OF_TURBULENCE))
         return LoopDelay(1.0, 0.0, 1.0, 0.0)
     values, delay = _delay(report)
     part.values = [*values, *part.values]
@@ -234,8 +239,7 @@ def _noise(report: LoopReport, delay: LoopDelay) -> OpenLoop | None:
     try:
         open_loop = open_loop_of(loop, delay)
     except InputError as error:
-        for name in ("noise", "turbulence", "vibrations", "spectra", "choices"):
-            report.parts[name].missing = report.parts[name].missing or f"{error}."
+        report.lack(f"{error}.", ("noise", *_OF_TURBULENCE))
         return None
     known = np.isfinite(open_loop.variance_error)
     if not known.any():
@@ -257,13 +261,10 @@ def _noise(report: LoopReport, delay: LoopDelay) -> OpenLoop | None:
         to_nm = scale / loop.unit * ARCSEC * loop.subaperture_m * 1e9
         part.values.append(Measured("tilt over a sub-aperture", "nm", rms * to_nm, spread * to_nm, remark))
     if loop.cells is None:
-        for name in ("turbulence", "vibrations", "spectra", "choices"):
-            report.parts[name].missing = report.parts[name].missing or _TEXT["without_cells"]
+        report.lack(_TEXT["without_cells"])
     unmeasured = 1 - float(open_loop.telemetry.trust[open_loop.telemetry.trust.any(axis=1)].mean())
     if unmeasured > _MOST_UNMEASURED:
-        why = f"{unmeasured:.0%} of the slopes were not measured, more than {_MOST_UNMEASURED:.0%}."
-        for name in ("turbulence", "vibrations", "spectra", "choices"):
-            report.parts[name].missing = report.parts[name].missing or why
+        report.lack(f"{unmeasured:.0%} of the slopes were not measured, more than {_MOST_UNMEASURED:.0%}.")
     return None if report.parts["turbulence"].missing else open_loop
 
 
@@ -275,7 +276,7 @@ def _turbulence(report: LoopReport, open_loop: OpenLoop, delay: LoopDelay) -> Id
         identification = Identification(open_loop.telemetry, site, loop.frame_rate_hz)
         identified = identification.layers()
     except InputError as error:
-        part.missing = report.parts["vibrations"].missing = report.parts["spectra"].missing = str(error)
+        report.lack(str(error), ("turbulence", "vibrations", "spectra"))
         return None
     report.turbulence = identified
     _mirror(report, open_loop, identified)
