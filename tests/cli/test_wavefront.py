@@ -6,11 +6,9 @@ import numpy as np
 import pytest
 from tests.cli.cli_cases import CONFIGURATION, Commands, simulated
 from tests.slopes.sensor.sensor_cases import spot_frame
-from tests.slopes.wavefront.test_fit import slopes_of
 
 from faintspot import Layout
 from faintspot.base.text_files import parse_json, plain_values
-from faintspot.cli.wavefront import _with_error_of
 from faintspot.io import read_slopes
 from faintspot.slopes.pipeline.configuration import to_text
 from faintspot.slopes.pipeline.slopes import Slopes
@@ -143,14 +141,6 @@ def test_difference_of_two_recordings(run: Commands, slopes: Path, no_picture: N
         again = parse_json(Path("w.json").read_text())["mean"]
         means = [mode["mean"] for mode in again["modes"]]
         assert means == pytest.approx([mode["mean"] for mode in moved["modes"]], abs=0.02)
-
-
-def test_errors_of_what_is_subtracted_count() -> None:
-    layout, noise = Layout.grid((7, 7), pixels=8), np.random.default_rng(1).normal(0.0, 0.1, (30, 2, 49))
-    slopes = slopes_of(noise)
-    wavefront = fit_wavefront(slopes, layout)
-    both = _with_error_of(slopes, layout, wavefront)
-    np.testing.assert_allclose(both.mean_standard_error, np.sqrt(2) * wavefront.mean_standard_error)
 
 
 def test_displaced_source_is_a_tilt(run: Commands, slopes: Path, no_picture: None) -> None:

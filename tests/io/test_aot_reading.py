@@ -228,7 +228,7 @@ def test_layout_of_the_configuration_comes_first(tmp_path: Path) -> None:
     for item in (layout, fs.Settings("centroid")):
         item.save(tmp_path / "faintspot.toml")
     summary = measure_recorded([tmp_path / "e.fits"], tmp_path / "faintspot.toml", tmp_path / "s.npz")
-    assert (summary.n_frames, summary.found.origin) == (10, "")
+    assert (summary.n_frames, summary.notes) == (10, [])
     with open_frames([tmp_path / "e.fits"]) as frames:
         block = frames.block(0, 10)
     expected = fs.SlopePipeline(layout, fs.Settings("centroid")).with_dark(block.mean(axis=0))(block)

@@ -65,6 +65,10 @@ class Estimate:
 # Slope errors -------------------------------------------------------------------------------------------
 
 
+UNKNOWN = Estimate(math.nan)
+"""A number that is not known."""
+
+
 def absolute_errors(x: ArrayLike, y: ArrayLike, truth: ArrayLike) -> NDArray[np.float64]:
     """Return (|dx| + |dy|) / 2 of every slope: the terms whose mean is R.
 

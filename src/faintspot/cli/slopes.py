@@ -140,14 +140,10 @@ def describe(summary: Summary, output: str) -> list[str]:
     """Summarise the run and suggest the next command."""
     if summary.resumed_at == summary.n_frames:
         return [
-            f"{output}: complete already ({_count(summary.n_frames, 'frame')}); --overwrite makes it anew",
+            f"{output}: complete already ({summary.n_frames} frames); --overwrite makes it anew",
             *_next_step(output),
         ]
-    lines = [
-        f"{output}: {_count(summary.n_frames, 'frame')}, {_count(summary.n_subapertures, 'sub-aperture')}"
-    ]
-    if summary.found.origin:
-        lines.append(f"  {summary.found.origin}")
+    lines = [f"{output}: {summary.n_frames} frames, {summary.n_subapertures} sub-apertures"]
     if summary.resumed_at:
         lines.append(
             f"  went on at frame {summary.resumed_at} (counted from 0); the counts are from there on"
@@ -165,31 +161,17 @@ def describe(summary: Summary, output: str) -> list[str]:
     for flag, text in texts.items():
         count = summary.flag_counts.get(flag, 0)
         if count:
-            lines.append(f"  {_count(count, 'slope')} {text} ({100 * count / summary.measured:.3g} %)")
-    if summary.found.saturation_adu is not None:
-        lines.append(
-            f"  values pile up at {summary.found.saturation_adu:g} ADU, taken as saturation; "
-            "saturation_adu in [calibration] states it"
-        )
-    if summary.found.background:
-        lines.append(f"  {summary.found.background}")
+            lines.append(f"  {count} slopes {text} ({100 * count / summary.measured:.3g} %)")
     if summary.repeated_frames:
-        lines.append(
-            f"  {_count(summary.repeated_frames, 'frame')} repeated: every pixel as in the one before"
-        )
-    if summary.found.reference:
-        lines.append(f"  {summary.found.reference}")
-    if not any(summary.flag_counts.values()) and not summary.found.doubtful:
+        lines.append(f"  {summary.repeated_frames} frames repeated: every pixel as in the one before")
+    lines += [f"  {note}" for note in summary.notes]
+    if not any(summary.flag_counts.values()) and not summary.doubtful:
         lines.append("  every slope is valid, without any flag")
     if summary.failed_frames:
-        lines.append(f"  {_count(summary.failed_frames, 'frame')} without slopes: {summary.failure}")
+        lines.append(f"  {summary.failed_frames} frames without slopes: {summary.failure}")
     if summary.bad_frames:
-        lines.append(f"  {_count(summary.bad_frames, 'frame')} without any valid slope")
+        lines.append(f"  {summary.bad_frames} frames without any valid slope")
     return lines + _next_step(output)
-
-
-def _count(number: int, noun: str) -> str:
-    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
 
 
 def _next_step(output: str) -> list[str]:

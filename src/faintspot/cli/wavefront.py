@@ -10,7 +10,7 @@ import click
 import numpy as np
 
 from faintspot.base.errors import InputError
-from faintspot.base.files import derived
+from faintspot.base.files import check_ending, derived
 from faintspot.cli.commands import SectionedCommand, can_make, declared, errors_of_options, option
 from faintspot.cli.output import picture_file, write_picture
 from faintspot.io.frames import read_array
@@ -21,8 +21,8 @@ from faintspot.slopes.recorded.stored_run import StoredRun, open_run
 from faintspot.slopes.sensor.layout import OPTICS, Layout
 from faintspot.slopes.wavefront import Wavefront, certify, fit_drift, fit_wavefront, save_wavefront
 from faintspot.slopes.wavefront.files import (
+    WAVEFRONT_ENDING,
     certificate_table,
-    check_wavefront_file,
     drift_table,
     mode_table,
     remarks,
@@ -71,12 +71,7 @@ def command(
     modes: int | None,
     minus: str | None,
     drift: int | None,
-    frame_rate_hz: float | None,
-    wavelength_nm: float | None,
-    actuators: str | None,
-    stroke: float | None,
-    command_file: str | None,
-    **scales: float | None,
+    **options: Any,
 ) -> None:
     """Fit Zernike modes to slopes, draw the wavefront, and find the command that would flatten it.
 
@@ -95,18 +90,18 @@ def command(
       faintspot wavefront slopes.zarr --actuators faintspot.control.npz:interaction_matrix
     """
     if output is not None:
-        check_wavefront_file(Path(output))
-    target = Path(command_file) if command_file else derived(slopes, "_command.npy")
+        check_ending(Path(output), WAVEFRONT_ENDING)
+    actuators, stroke = options["actuators"], options["stroke"]
+    target = Path(options["command_file"] or derived(slopes, "_command.npy"))
     check_command_file(target)
-    if actuators is None and (stroke is not None or command_file is not None):
+    if actuators is None and (stroke is not None or options["command_file"] is not None):
         raise InputError("--stroke, --command: expected --actuators with an interaction matrix, got none")
     interaction = None if actuators is None else read_array(actuators)
     drawing = picture_file(Path(slopes), picture, "_wavefront.png")
     run = open_run(Path(slopes))
     if run.layout is None:
         raise InputError(f"{slopes}: expected slopes with their layout ({' '.join(run.notes)})")
-    given: dict[str, Any] = {name: value for name, value in scales.items() if value is not None}
-    layout = replace(run.layout, **given)
+    layout = replace(run.layout, **{name: options[name] for name in OPTICS if options[name] is not None})
     # A difference of positions in the frame lacks nothing.
     notes = [note for note in run.notes if minus is None or note != run.about_reference]
     measured, other = Slopes.from_variables(run.stored.variables, keep=run.keep), None
@@ -119,12 +114,13 @@ def command(
         wavefront = fit_wavefront(measured, layout, modes=modes)
     if other is not None:
         with errors_of_options(minus or slopes):
-            wavefront = _with_error_of(other, layout, wavefront)
+            subtracted = fit_wavefront(other, layout, modes=len(wavefront.modes))
+            wavefront = replace(wavefront, subtracted=subtracted)
     with errors_of_options(actuators):
         flat = None if interaction is None else flattening(measured, interaction, stroke)
-    found = certify(wavefront, wavelength_nm=wavelength_nm)
+    found = certify(wavefront, wavelength_nm=options["wavelength_nm"])
     with errors_of_options(slopes):
-        over_time = drift and fit_drift(wavefront, drift, frame_rate_hz=frame_rate_hz)
+        over_time = drift and fit_drift(wavefront, drift, frame_rate_hz=options["frame_rate_hz"])
     tables = [mode_table(wavefront), certificate_table(found, wavefront.unit)]
     _print([*tables, drift_table(over_time, wavefront)] if over_time else tables, wavefront, notes)
     if output is not None:
@@ -151,11 +147,6 @@ def _reference(run: StoredRun, notes: list[str]) -> Slopes | None:
     except InputError as error:
         notes.append(f"The reference {file} is taken as exact: {error}.")
         return None
-
-
-def _with_error_of(other: Slopes, layout: Layout, wavefront: Wavefront) -> Wavefront:
-    """Return a wavefront from which another was subtracted, with the errors of both."""
-    return replace(wavefront, subtracted=fit_wavefront(other, layout, modes=len(wavefront.modes)))
 
 
 def _write_flattening(

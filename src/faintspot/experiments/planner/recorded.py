@@ -169,16 +169,17 @@ def _calibration(
     if darks is not None:
         dark = darks.mean(axis=0)
     elif measured is not None:
-        dark = measured.dark_level_adu
-    read_noise_adu = pixel_noise(layout.images(stack)) if measured is None else measured.read_noise_adu
+        dark = measured.dark_level_adu.value
+    read_noise_adu = pixel_noise(layout.images(stack)) if measured is None else measured.read_noise_adu.value
     how = "from the darkest pixels of the frames" if darks is None or len(darks) < 2 else "from the darks"
     if gain is None:
-        if measured is None or measured.gain_e_per_adu is None or measured.gain_e_per_adu_error is None:
+        if measured is None or np.isnan(measured.gain_e_per_adu.value):
             raise InputError(
                 "gain_e_per_adu: expected a value, as the frames do not tell the gain: a single frame is not "
                 "enough"
             )
-        gain, error, way = measured.gain_e_per_adu, measured.gain_e_per_adu_error, "from frame to frame"
+        gain, error = measured.gain_e_per_adu.value, measured.gain_e_per_adu.standard_error
+        way = "from frame to frame"
         about_spots = _measured_on_spots(stack, dark, layout, em_gain)
         if isinstance(about_spots, str):
             if not measured.reliable:

@@ -1,6 +1,7 @@
 """Read noise and gain of a camera, from dark frames and from frames with constant flux."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -10,7 +11,7 @@ from scipy.stats import chi2
 
 from faintspot.base.checks import finite_array, number_between
 from faintspot.base.errors import InputError
-from faintspot.base.statistics import MAD_TO_STD
+from faintspot.base.statistics import MAD_TO_STD, UNKNOWN, Estimate
 from faintspot.slopes.camera.dark_frames import DarkPixels, dark_pixels
 from faintspot.slopes.camera.frame_checks import are_repeated
 from faintspot.slopes.camera.transfer_curve import LineFit, TransferCurve, fit_line, photon_transfer
@@ -18,7 +19,6 @@ from faintspot.slopes.sensor.layout import Layout
 
 Floats = NDArray[np.float64]
 
-_BY_DARKS = "read noise and dark level: dark frames, median pixel"
 _LARGEST_SCATTER = 3.0  # mean square of bright pixels' variances about the line, over the expected one
 _LARGEST_SECOND_ORDER = 0.15  # largest relative change of the slope by second derivatives
 _LARGEST_CURVATURE = 0.25  # relative difference of the gains from faint and bright pixels
@@ -28,20 +28,16 @@ _DARKEST = 0.01  # fraction of pixels whose level is used as dark level if it is
 
 @dataclass(frozen=True)
 class DetectorMeasurement:
-    """Result of `measure_detector`; None for values that could not be measured. Errors are standard errors.
+    """Result of `measure_detector`, with standard errors; NaN for values that could not be measured.
 
     Parameters
     ----------
-    read_noise_adu, read_noise_adu_error : float
+    read_noise_adu : Estimate
         Standard deviation of a typical pixel in the dark.
-    gain_e_per_adu, gain_e_per_adu_error : float or None
-        Electrons (after multiplication) per ADU.
-    dark_level_adu, dark_level_adu_error : float
+    dark_level_adu : Estimate
         Level of a typical pixel in the dark.
-    read_noise_e, read_noise_e_error : float or None
-        Read noise in electrons at the camera's output, as in `faintspot.slopes.simulate.Detector`.
-    faint_gain_e_per_adu, bright_gain_e_per_adu : float or None
-        Gain from the pixels with the fainter and the brighter half of the flux separately.
+    gain_e_per_adu : Estimate
+        Electrons (after multiplication) per ADU.
     reliable : bool
         False if the gain is not reliable: the variance is not linear in the mean, does not increase with the
         flux, or the flux moves too much. The last of `notes` gives the reason.
@@ -51,35 +47,27 @@ class DetectorMeasurement:
         Dark level and noise [ADU] of each pixel, and the pixels that blink or are hot, from dark frames.
     """
 
-    read_noise_adu: float
-    read_noise_adu_error: float
-    gain_e_per_adu: float | None
-    gain_e_per_adu_error: float | None
-    dark_level_adu: float
-    dark_level_adu_error: float
-    read_noise_e: float | None
-    read_noise_e_error: float | None
-    faint_gain_e_per_adu: float | None
-    bright_gain_e_per_adu: float | None
+    read_noise_adu: Estimate
+    dark_level_adu: Estimate
+    gain_e_per_adu: Estimate
     reliable: bool
     notes: tuple[str, ...]
     pixels: DarkPixels | None = None
+
+    @property
+    def read_noise_e(self) -> Estimate:
+        """Read noise in electrons at the camera's output, as in `faintspot.slopes.simulate.Detector`."""
+        noise, gain = self.read_noise_adu, self.gain_e_per_adu
+        error = math.hypot(noise.standard_error * gain.value, noise.value * gain.standard_error)
+        return Estimate(noise.value * gain.value, error)
 
 
 class _Dark(NamedTuple):
     """Dark level of each pixel or of all, and of a typical pixel."""
 
     level: Any
-    typical: float
-    typical_error: float
+    typical: Estimate
     pixels: DarkPixels | None = None
-
-
-class _Value(NamedTuple):
-    """Value and standard error."""
-
-    value: float
-    error: float
 
 
 def measure_detector(
@@ -135,35 +123,33 @@ def measure_detector(
     >>> darks = camera.expose(np.zeros((20, 64, 64)), rng)
     >>> lit = camera.expose(np.tile(np.linspace(10.0, 400.0, 64), (100, 64, 1)), rng)
     >>> found = fs.measure_detector(lit, darks)
-    >>> print(f"read noise {found.read_noise_e:.1f} e-, gain {found.gain_e_per_adu:.2f} e-/ADU")
+    >>> print(f"read noise {found.read_noise_e.value:.1f} e-, gain {found.gain_e_per_adu.value:.2f} e-/ADU")
     read noise 3.0 e-, gain 0.50 e-/ADU
     """
-    multiplication, repeated = number_between("em_gain", em_gain, 1.0), list[str]()
-    if frames is None:
-        if darks is None:
-            raise InputError("frames, darks: expected at least one of them, got neither")
-        dark, read_noise = _measure_dark(_frames("darks", darks, repeated))
-        return _result(dark, read_noise, None, (None, None), multiplication, [*repeated, _BY_DARKS])
-    stack = _frames("frames", frames, repeated)
+    multiplication, notes = number_between("em_gain", em_gain, 1.0), list[str]()
+    if frames is None and darks is None:
+        raise InputError("frames, darks: expected at least one of them, got neither")
+    stack = None if frames is None else _frames("frames", frames, notes)
+    if darks is not None:
+        dark, read_noise = _measure_dark(_frames("darks", darks, notes))
+        notes.append("read noise and dark level: dark frames, median pixel")
+    if stack is None:
+        return DetectorMeasurement(read_noise, dark.typical, UNKNOWN, True, tuple(notes), dark.pixels)
     if darks is None:
         dark, note = _dark_without_darks(stack, dark_level_adu)
-        notes = [note, "read noise: darkest pixels of the frames, less their photon noise"]
-    else:
-        dark, read_noise = _measure_dark(_frames("darks", darks, repeated))
-        notes = [_BY_DARKS]
-        if np.shape(dark.level) != stack.shape[1:]:
-            raise InputError(f"darks: expected frames of {stack.shape[1:]}, got {np.shape(dark.level)}")
+        notes += [note, "read noise: darkest pixels of the frames, less their photon noise"]
+    elif np.shape(dark.level) != stack.shape[1:]:
+        raise InputError(f"darks: expected frames of {stack.shape[1:]}, got {np.shape(dark.level)}")
     everything = photon_transfer(stack, dark.level, layout)
     curve = everything.within(range_adu)
     line = fit_line(curve)
     if darks is None:
         read_noise = _read_noise_without_darks(everything, line)
     coarse = fit_line(photon_transfer(stack, dark.level, layout, order=1).within(range_adu))
-    halves = tuple(fit_line(half) for half in curve.halves())
-    notes += repeated
-    notes.append("gain: slope of variance against mean")
-    problem = _problem(line, coarse, halves)
-    return _result(dark, read_noise, line, halves, multiplication, notes, problem)
+    problem = _problem(line, coarse, [fit_line(half) for half in curve.halves()])
+    notes += ["gain: slope of variance against mean", *([problem] if problem else [])]
+    gain = _gain(line, multiplication)
+    return DetectorMeasurement(read_noise, dark.typical, gain, not problem, tuple(notes), dark.pixels)
 
 
 def _frames(name: str, value: object, notes: list[str]) -> Floats:
@@ -180,7 +166,7 @@ def _frames(name: str, value: object, notes: list[str]) -> Floats:
     return frames[~repeated]
 
 
-def _measure_dark(darks: Floats) -> tuple[_Dark, _Value]:
+def _measure_dark(darks: Floats) -> tuple[_Dark, Estimate]:
     """Measure the dark level of each pixel and the read noise of the median pixel."""
     level = darks.mean(axis=0)
     drift = np.median(darks - level, axis=(1, 2))
@@ -192,21 +178,22 @@ def _measure_dark(darks: Floats) -> tuple[_Dark, _Value]:
     # Variance of the median of many variances: 1.25 times that of their mean.
     relative = 1.25 * math.sqrt(2 / (degrees * level.size))
     spread = 1.25 * MAD_TO_STD * float(np.median(np.abs(level - np.median(level)))) / math.sqrt(level.size)
-    dark = _Dark(level, float(np.median(level)), spread, dark_pixels(level, residuals))
-    return dark, _Value(read_noise, 0.5 * relative * read_noise)
+    typical = Estimate(float(np.median(level)), spread)
+    pixels = dark_pixels(level, residuals)
+    return _Dark(level, typical, pixels), Estimate(read_noise, 0.5 * relative * read_noise)
 
 
 def _dark_without_darks(frames: Floats, dark_level_adu: float | None) -> tuple[_Dark, str]:
     if dark_level_adu is not None:
         level = number_between("dark_level_adu", dark_level_adu)
-        return _Dark(level, level, 0.0), "dark level: given"
+        return _Dark(level, Estimate(level, 0.0)), "dark level: given"
     mean = frames.mean(axis=0)
     level = float(np.quantile(mean, _DARKEST))
     noise = math.sqrt(float(np.median(np.square(np.diff(frames, axis=0)))) / len(frames))
-    return _Dark(level, level, noise), "dark level: darkest percent of the frames, with stray light"
+    return _Dark(level, Estimate(level, noise)), "dark level: darkest percent of the frames, with stray light"
 
 
-def _read_noise_without_darks(curve: TransferCurve, line: LineFit | None) -> _Value:
+def _read_noise_without_darks(curve: TransferCurve, line: LineFit | None) -> Estimate:
     """Estimate the read noise from the darkest pixels, less the photon noise that the line gives."""
     darkest = curve.mean <= np.quantile(curve.mean, _DARKEST_FOR_NOISE)
     # The median of a chi-squared distribution lies below its mean.
@@ -217,52 +204,19 @@ def _read_noise_without_darks(curve: TransferCurve, line: LineFit | None) -> _Va
     variance = total - photons if 0 < photons < total else total
     relative = 1.25 * math.sqrt(2 / (curve.degrees * np.count_nonzero(darkest)))
     read_noise = math.sqrt(variance)
-    return _Value(read_noise, 0.5 * relative * total / read_noise if read_noise else 0.0)
+    return Estimate(read_noise, 0.5 * relative * total / read_noise if read_noise else 0.0)
 
 
-def _result(
-    dark: _Dark,
-    read_noise: _Value,
-    line: LineFit | None,
-    halves: tuple[LineFit | None, ...],
-    em_gain: float,
-    notes: list[str],
-    problem: str | None = None,
-) -> DetectorMeasurement:
-    """Combine the parts; without frames there are no lines."""
-    gain = _gain(line, em_gain)
-    faint, bright = (_gain(half, em_gain) for half in halves)
-    in_electrons = None
-    if gain is not None:
-        error = math.hypot(read_noise.error * gain.value, read_noise.value * gain.error)
-        in_electrons = _Value(read_noise.value * gain.value, error)
-    return DetectorMeasurement(
-        read_noise_adu=read_noise.value,
-        read_noise_adu_error=read_noise.error,
-        gain_e_per_adu=gain and gain.value,
-        gain_e_per_adu_error=gain and gain.error,
-        dark_level_adu=dark.typical,
-        dark_level_adu_error=dark.typical_error,
-        read_noise_e=in_electrons and in_electrons.value,
-        read_noise_e_error=in_electrons and in_electrons.error,
-        faint_gain_e_per_adu=faint and faint.value,
-        bright_gain_e_per_adu=bright and bright.value,
-        reliable=problem is None,
-        notes=tuple(notes) if problem is None else (*notes, problem),
-        pixels=dark.pixels,
-    )
-
-
-def _gain(line: LineFit | None, em_gain: float) -> _Value | None:
+def _gain(line: LineFit | None, em_gain: float) -> Estimate:
     """Return electrons per ADU and its error: the variance in ADU is excess * em_gain * flux / gain."""
     if line is None or line.slope <= 0:
-        return None
+        return UNKNOWN
     gain = (2.0 * em_gain if em_gain > 1 else 1.0) / line.slope
-    return _Value(gain, gain * line.slope_error / line.slope)
+    return Estimate(gain, gain * line.slope_error / line.slope)
 
 
-def _problem(line: LineFit | None, coarse: LineFit | None, halves: tuple[LineFit | None, ...]) -> str | None:
-    """Return the reason why the gain is not reliable, or None.
+def _problem(line: LineFit | None, coarse: LineFit | None, halves: Sequence[LineFit | None]) -> str:
+    """Return the reason why the gain is not reliable, or nothing.
 
     If second derivatives of the image affect the residuals of movements, third ones may do so, too.
     """
@@ -274,11 +228,11 @@ def _problem(line: LineFit | None, coarse: LineFit | None, halves: tuple[LineFit
         return "the flux moves too much between frames: the gain is too low"
     faint, bright = halves
     if faint is None or bright is None:
-        return None
+        return ""
     difference = abs(bright.slope - faint.slope)
     noise = math.hypot(bright.slope_error, faint.slope_error)
     if difference <= max(4 * noise, _LARGEST_CURVATURE * line.slope):
-        return None
+        return ""
     return (
         "gains from faint and bright pixels disagree: the flux moves or fluctuates too much, "
         "pixels saturate or are clipped, or the camera has two gains"

@@ -49,28 +49,15 @@ Progress = Callable[[int, int], None]
 
 
 @dataclass
-class Findings:
-    """Properties of frames and layout that no configuration states."""
-
-    origin: str = ""
-    """Description of the values taken from a file of telemetry."""
-    reference: str = ""
-    """Description of the reference where it was fitted to a frame."""
-    saturation_adu: float | None = None
-    """Saturation level found in the frames, where the configuration states none."""
-    background: str = ""
-    """Level subtracted instead of an estimated dark that does not fit the frames."""
-    doubtful: bool = False
-    """Whether the layout has doubts that nobody has settled."""
-
-
-@dataclass
 class Summary:
     """Summary of a run over recorded frames."""
 
     n_frames: int
     n_subapertures: int
-    found: Findings
+    notes: list[str] = field(default_factory=list)
+    """What no configuration states, a line each: of frames, calibration and reference."""
+    doubtful: bool = False
+    """Whether the layout has doubts that nobody has settled."""
     resumed_at: int = 0
     flag_counts: dict[SubapertureFlag, int] = field(default_factory=dict)
     """Number of slopes of this call with each flag."""
@@ -182,13 +169,12 @@ def measure_recorded(
     layout, settings = described.layout, _settings(described.settings, choices)
     with open_frames(frames, key=key, time_axis=choices.get("time_axis")) as source:
         _check_files(source, frames, output, layout, configuration_file)
-        found = Findings(origin, doubtful=bool(layout.doubts))
-        summary = Summary(source.n_frames, len(layout), found)
-        if positions is None:
-            found.reference = reference_in_words(layout.fitted)
+        summary = Summary(source.n_frames, len(layout), doubtful=bool(layout.doubts))
+        reference_words = "" if positions is not None else reference_in_words(layout.fitted)
         seen = survey(source.shape, stretches(source))
         try:
-            calibration = _calibration(described.calibration, settings, layout, seen, found)
+            calibration, notes = _calibration(described.calibration, settings, layout, seen)
+            summary.notes = [note for note in (origin, *notes, reference_words) if note]
             spot: dict[str, Any] = described.spot
             pipeline = SlopePipeline(layout, settings, calibration, positions, **spot, threads=threads)
         except InputError as error:
@@ -202,7 +188,11 @@ def measure_recorded(
         if positions is not None:
             attributes["reference"] = np.asarray(positions).tolist()
         with errors_within(configuration_file):
-            measure = _follower(pipeline) if follow else pipeline.with_dark(seen.mean)
+            measure: SlopePipeline | SpotFollower = pipeline.with_dark(seen.mean)
+            if follow:
+                from faintspot.slopes.pipeline.following import SpotFollower
+
+                measure = SpotFollower(pipeline)
 
         def shown() -> dict[str, Any]:
             if not isinstance(measure, SlopePipeline) or source.n_frames < _FRAMES_FOR_RESPONSE:
@@ -236,12 +226,6 @@ def measure_recorded(
     return summary
 
 
-def _follower(pipeline: SlopePipeline) -> SpotFollower:
-    from faintspot.slopes.pipeline.following import SpotFollower
-
-    return SpotFollower(pipeline)
-
-
 def _settings(settings: Settings, choices: Choices) -> Settings:
     """Return the settings as changed by the arguments."""
     if changes := choices.get("changes"):
@@ -252,22 +236,21 @@ def _settings(settings: Settings, choices: Choices) -> Settings:
 
 
 def _calibration(
-    calibration: Calibration, settings: Settings, layout: Layout, seen: Survey, found: Findings
-) -> Calibration:
-    """Return the calibration with what the frames show: saturation, where none is stated, and the dark."""
+    calibration: Calibration, settings: Settings, layout: Layout, seen: Survey
+) -> tuple[Calibration, list[str]]:
+    """Return the calibration with what the frames show, and notes on saturation and dark."""
     calibration.maps(layout.frame_shape)  # refuses maps of another shape
+    notes = []
     if calibration.saturation_adu is None and seen.saturation_adu is not None:
-        found.saturation_adu = seen.saturation_adu
         calibration = replace(calibration, saturation_adu=seen.saturation_adu)
-    is_wide = _are_wide(settings, layout)
-    calibration, found.background = with_fitting_dark(calibration, layout, seen.mean, is_wide=is_wide)
-    return calibration
-
-
-def _are_wide(settings: Settings, layout: Layout) -> bool:
-    """Return whether spots are so wide that their wings reach the border of windows."""
+        notes.append(
+            f"values pile up at {seen.saturation_adu:g} ADU, taken as saturation; saturation_adu in "
+            "[calibration] states it"
+        )
     width = np.nan_to_num(spot_fwhm_px(settings, len(layout), layout.pixels))
-    return bool(width.max() > _WIDE * min(layout.window))
+    is_wide = bool(width.max() > _WIDE * min(layout.window))  # wings reach the border of windows
+    calibration, background = with_fitting_dark(calibration, layout, seen.mean, is_wide=is_wide)
+    return calibration, [*notes, background]
 
 
 def _with_mean_flux(pipeline: SlopePipeline, source: FrameSource) -> SlopePipeline:

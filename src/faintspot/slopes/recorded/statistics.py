@@ -17,14 +17,13 @@ from numpy.typing import NDArray
 
 from faintspot.base.checks import finite_array
 from faintspot.base.flags import SubapertureFlag
-from faintspot.base.statistics import Estimate, absolute_errors, slope_statistics
+from faintspot.base.statistics import UNKNOWN, Estimate, absolute_errors, slope_statistics
 from faintspot.slopes.pipeline.slopes import Slopes
 
 Floats = NDArray[np.float64]
 
 
 _BLOCK_NUMBERS = 1 << 22  # numbers worked on at a time: bounds the memory of the double-precision copies
-UNKNOWN = Estimate(np.nan)
 
 
 @dataclass(frozen=True)

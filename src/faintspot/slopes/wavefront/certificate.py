@@ -14,7 +14,7 @@ from scipy.stats import t as student
 
 from faintspot.base.checks import number_between
 from faintspot.base.errors import InputError
-from faintspot.base.statistics import SEED, Estimate
+from faintspot.base.statistics import SEED, UNKNOWN, Estimate
 from faintspot.slopes.wavefront.fit import NM, Wavefront
 from faintspot.slopes.wavefront.zernike import zernike
 
@@ -29,7 +29,6 @@ _AS_NORMAL = 1e6  # degrees of freedom
 _CLOSE = 1e-4  # relative difference of PV at which a step is the last
 _LOW, _HIGH = 0.025, 0.975
 _DEFOCUS = 2  # index of Z4
-UNKNOWN = Estimate(np.nan)
 
 
 @dataclass(frozen=True, kw_only=True)

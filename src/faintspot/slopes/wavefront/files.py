@@ -14,6 +14,7 @@ from faintspot.slopes.wavefront.fit import NM, Floats, Wavefront, total
 from faintspot.slopes.wavefront.zernike import mode_name, noll_to_nm, osa_index
 
 _TEXT = Texts("faintspot.slopes.wavefront")
+WAVEFRONT_ENDING = ".json"
 
 
 def mode_records(wavefront: Wavefront) -> list[dict[str, Any]]:
@@ -152,16 +153,11 @@ def save_wavefront(
     >>> save_wavefront("wavefront.json", fs.fit_wavefront(slopes, layout, modes=5))
     """
     path = Path(path)
-    check_wavefront_file(path)
+    check_ending(path, WAVEFRONT_ENDING)
     over_time = {} if drift is None else {"drift": vars(drift)}
     write_atomically(
         path, to_json({**_values(wavefront, found or certify(wavefront)), **over_time}, indent=1)
     )
-
-
-def check_wavefront_file(path: Path) -> None:
-    """Refuse an unknown ending before the work."""
-    check_ending(path, ".json")
 
 
 def _values(wavefront: Wavefront, found: Certificate) -> dict[str, Any]:

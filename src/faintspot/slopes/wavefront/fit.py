@@ -63,11 +63,15 @@ class Wavefront:
     unit: str
     """Unit: "nm", or "px × sub-aperture" (slopes in pixels, lengths in sub-apertures)."""
     pupil: Pupil
-    errors_from: str
-    """Source of the standard errors: those of the slopes ("slopes"), or the slopes' scatter about the fit
-    ("residuals"), which counts as noise what is not fitted."""
     left_out: str = ""
     """Line about the slopes that were left out; empty if there are none."""
+
+    @property
+    def errors_from(self) -> str:
+        """Source of the standard errors: those of the slopes ("slopes"), or the slopes' scatter about the
+        fit ("residuals"), which counts as noise what is not fitted.
+        """
+        return "slopes" if np.isinf(self.freedom) else "residuals"
 
     @property
     def fitted(self) -> NDArray[np.bool_]:
@@ -268,7 +272,6 @@ def fit_wavefront(slopes: Slopes, layout: Layout, *, modes: int | None = None) -
         outlines=(lenslet_outlines(layout)[illuminated] - pupil.centre_px) / pupil.radius_px,
         unit=unit,
         pupil=pupil,
-        errors_from="slopes" if has_errors else "residuals",
         left_out=left_out,
     )
 
