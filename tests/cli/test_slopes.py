@@ -41,15 +41,6 @@ def test_key_chooses_an_array_of_a_file(folder: Path, run: Commands) -> None:
 
 
 @pytest.mark.slow
-def test_no_denoise_is_the_other_method(folder: Path, run: Commands) -> None:
-    frames = simulated()
-    np.save("a.npy", frames)
-    run.ok("slopes", "a.npy", "-o", "s.npz", "--no-denoise")
-    assert_equal(folder / "s.npz", SlopePipeline(LAYOUT, SETTINGS.replace(estimator="brightest"))(frames))
-    assert read_slopes(folder / "s.npz").variables["iterations"].max() == 0
-
-
-@pytest.mark.slow
 def test_preset_goes_before_the_configuration(folder: Path, run: Commands) -> None:
     frames = simulated()
     np.save("a.npy", frames)
@@ -225,11 +216,3 @@ def test_damaged_configuration_is_refused(folder: Path, run: Commands) -> None:
         (folder / "faintspot.toml").write_text(text)
         run.refused("slopes", "a.npy", naming=("faintspot.toml", *naming))
     assert not (folder / "slopes.zarr").exists()
-
-
-@pytest.mark.parametrize("output", ["s.zarr", "s.npz", "s.fits"])
-def test_output_of_another_run(folder: Path, run: Commands, output: str) -> None:
-    np.save("a.npy", simulated())
-    run.ok("slopes", "a.npy", "-o", output)
-    run.refused("slopes", "a.npy", "-o", output, "--no-denoise", naming=(output, "another run"))
-    assert_equal(folder / output, expected(simulated()))

@@ -44,10 +44,6 @@ def command(slopes: tuple[str, ...], output: str | None, recording: tuple[str, .
     paths = [Path(path) for path in slopes]
     if output is not None and Path(output).resolve() in [path.resolve() for path in paths]:
         raise InputError(f"{output}: expected a name for the page, got the slopes' own")
-    if output is not None and not Path(output).absolute().parent.is_dir():
-        raise InputError(
-            f"{output}: the folder {Path(output).parent} does not exist: create it or choose another"
-        )
     for name in recording:
         split_location(name)  # refuses what is not there
     target = Path(output) if output is not None else derived(paths[0], ".html")

@@ -68,6 +68,9 @@ def test_windows_that_are_smaller_than_the_pitch_are_said(folder: Path, run: Com
         (("--grid", "8"), "--grid 8"),
         (("--grid", "8x8", "--pitch-px", "2"), "--pitch-px"),
         (("--grid", "80x8"), "cells of at least"),
+        (("--grid", "8x8", "--pixels", "3"), "within a cell"),
+        (("--grid", "8x8", "--roi", "0,0,300,20"), "roi = 0, 0, 300, 20"),
+        (("--grid", "8x8", "--pupil", "-90,0,3"), "no cell is illuminated"),
         (("--grid", "8x8", "--illuminated-fraction", "2"), "--illuminated-fraction"),
     ],
 )

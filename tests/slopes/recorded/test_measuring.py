@@ -6,12 +6,11 @@ from typing import Any
 import numpy as np
 import pytest
 from tests.cli.cli_cases import CONFIGURATION, LAYOUT, assert_equal, expected, simulated
-from tests.refusals import refused
 
 import faintspot
-from faintspot import InputError, SubapertureFlag
+from faintspot import InputError
 from faintspot.io import read_slopes
-from faintspot.slopes.recorded import Summary, measure_recorded
+from faintspot.slopes.recorded import measure_recorded
 
 
 @pytest.fixture
@@ -110,46 +109,6 @@ def test_the_output_says_where_it_comes_from(files: tuple[Path, Path, Path]) -> 
     assert "noise_std = 2.0" in stored.attributes["configuration"]
     np.testing.assert_array_equal(stored.coordinates["centre_x"], LAYOUT.centres[:, 0])
     np.testing.assert_array_equal(stored.coordinates["row"], LAYOUT.cells[:, 0])
-
-
-def test_reference_from_a_file_is_the_same(files: tuple[Path, Path, Path]) -> None:
-    frames, configuration, output = files
-    reference = np.random.default_rng(1).normal(size=(16, 2))
-    np.save(frames.with_name("r.npy"), reference)
-    measure_recorded([frames], configuration, output, reference=frames.with_name("r.npy"))
-    assert_equal(output, expected(simulated(), reference=reference))
-    summary = measure_recorded([frames], configuration, output, reference=reference)
-    assert summary.resumed_at == 30  # the same run
-
-
-def test_a_calibration_that_does_not_fit_names_the_configuration(files: tuple[Path, Path, Path]) -> None:
-    frames, configuration, output = files
-    np.save(frames.with_name("dark.npy"), np.ones((3, 4)))
-    configuration.write_text(CONFIGURATION + '[calibration]\ndark = "dark.npy"\n')
-    with refused("c.toml: calibration.dark: expected the frame's shape (32, 32), got (3, 4)"):
-        measure_recorded([frames], configuration, output)
-
-
-def test_frames_given_as_strings_or_paths_are_the_same_run(
-    files: tuple[Path, Path, Path], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    frames, configuration, output = files
-    measure_recorded([frames], configuration, output)
-    monkeypatch.chdir(frames.parent)
-    assert measure_recorded(["a.npy"], "c.toml", "s.npz").resumed_at == 30
-
-
-def test_summary_counts_flags() -> None:
-    frames = simulated()
-    frames[4] = 0
-    summary = Summary(30, 16)
-    summary.add(expected(frames))
-    assert summary.flag_counts[SubapertureFlag.NO_FLUX] == 16
-    assert summary.bad_frames == 1
-    assert set(expected(frames).variables) == {
-        *("x", "y", "flux", "valid", "flags", "iterations", "bad_pixels"),
-        *("standard_error_x", "standard_error_y", "covariance_xy"),
-    }
 
 
 @pytest.mark.slow

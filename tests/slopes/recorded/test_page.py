@@ -1,6 +1,5 @@
 """The report page: complete, self-contained, and honest about what is missing."""
 
-import sys
 from dataclasses import replace
 from typing import Any
 
@@ -8,7 +7,6 @@ import numpy as np
 import pytest
 from tests.slopes.recorded.recorded_cases import SETTINGS, Page, method_of, sensor, simulated, two_methods
 
-from faintspot.base.errors import MissingExtraError
 from faintspot.slopes.pipeline.slope_pipeline import SlopePipeline
 from faintspot.slopes.recorded.page import SlopesRun, method_numbers, slopes_report, warnings_in_words
 from faintspot.slopes.recorded.pictures import Example
@@ -68,12 +66,6 @@ def test_one_frame_says_that_there_is_no_jitter() -> None:
     assert page.ids == SECTIONS
 
 
-@pytest.mark.slow
-def test_page_of_one_subaperture() -> None:
-    layout = sensor((1, 1))
-    assert "1 of 8 × 8 px" in page_of(layout, *simulated(layout, 3)).text
-
-
 def test_page_says_when_everything_is_invalid() -> None:
     layout = sensor()
     page = page_of(layout, np.full((3, *layout.frame_shape), np.nan, np.float32), np.zeros((3, 9, 2)))
@@ -110,13 +102,6 @@ def test_warnings_say_what_to_do_next() -> None:
     assert "raise max_iterations" in text
     assert "1 of 5 sub-apertures were never valid (no. 0)" in text
     assert "NO_FLUX 4 (20" in text
-
-
-def test_missing_jinja2_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "jinja2", None)
-    layout = sensor((1, 1))
-    with pytest.raises(MissingExtraError, match=r"faintspot\[report\]"):
-        page_of(layout, simulated(layout, 1)[0])
 
 
 def moving(gain: float, noise: float, seed: int, n_frames: int = 400, n: int = 30) -> MeasuredSlopes:

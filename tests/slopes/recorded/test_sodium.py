@@ -135,20 +135,3 @@ def test_frames_without_spots_are_refused(tmp_path: Path, level: float, noise: f
         pytest.raises(InputError, match=r"images_e: expected (images of spots|flux)|dark"),
     ):
         sodium_of_frames(source, LAYOUT, known, LASER)
-
-
-def test_faint_spots_are_taken(recording: Path) -> None:
-    """Four frames of 200 e- are enough: the profile is near the one of all frames."""
-    with open_frames([recording / "frames.npy"]) as source:
-        known = sodium_of_frames(source, LAYOUT, calibration(), LASER, most_frames=4).sodium
-    assert known.fit.significance > 30
-    assert known.fit.profile.mean_m == pytest.approx(TRUE.mean_m, abs=1500)
-
-
-def test_a_layout_without_angles_is_refused(tmp_path: Path) -> None:
-    np.save(tmp_path / "none.npy", np.zeros((3, *LAYOUT.frame_shape)))
-    with (
-        open_frames([tmp_path / "none.npy"]) as source,
-        pytest.raises(InputError, match="pixel_scale_arcsec"),
-    ):
-        sodium_of_frames(source, replace(LAYOUT, pixel_scale_arcsec=None), fs.Calibration(), LASER)

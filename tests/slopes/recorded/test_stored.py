@@ -77,19 +77,6 @@ def test_two_stores_are_two_methods(tmp_path: Path) -> None:
     assert page.ids[-2:] == ["configuration-of-tv-denoising", "configuration-of-brightest-pixels"]
 
 
-@pytest.mark.slow
-def test_standard_errors_are_shown_where_they_are_known(tmp_path: Path) -> None:
-    x, y = np.full((2, 5, 9), np.inf)
-    unknown = store(tmp_path / "a.npz", sensor(), errors={"standard_error_x": x, "standard_error_y": y})
-    assert "stated error" not in Page(report_of_stored([unknown])).text
-    x[0], y[0] = 0.07, 0.01  # rms 0.05
-    x[1] = 0.2
-    known = store(tmp_path / "b.npz", sensor(), errors={"standard_error_x": x, "standard_error_y": y})
-    assert "0.0500" in Page(report_of_stored([known])).text
-    page = Page(report_of_stored([unknown, known]))
-    assert page.text.count("0.0500") == 1
-
-
 def test_two_stores_of_the_same_kind_are_named_by_their_files(tmp_path: Path) -> None:
     paths = [store(tmp_path / name, sensor()) for name in ("a.npz", "b.npz")]
     assert "Settings of 'b.npz'" in Page(report_of_stored(paths)).text

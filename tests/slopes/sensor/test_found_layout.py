@@ -11,7 +11,6 @@ from tests.slopes.sensor.sensor_cases import spot_frame
 
 import faintspot as fs
 from faintspot import Layout
-from faintspot.base.errors import InputError
 from faintspot.slopes.sensor.found_layout import find_illuminated, find_layout
 from faintspot.slopes.simulate import Detector
 
@@ -207,11 +206,6 @@ def test_illuminated_cells_are_not_taken_for_dark_ones(n: int) -> None:
         assert found.doubt
 
 
-def test_noise_is_said() -> None:
-    noise = np.random.default_rng(1).normal(size=(20, 20))
-    assert find_illuminated(noise, (10, 10), has_dark=True).doubt
-
-
 def test_windows_in_the_middle_of_cells_of_a_region() -> None:
     image = np.zeros((50, 60))
     image[5:45, 10:50] = 100.0
@@ -247,25 +241,3 @@ def test_the_fraction_decides() -> None:
         assert (
             len(find_illuminated(image, (3, 3), has_dark=True, illuminated_fraction=fraction).layout) == count
         )
-
-
-@pytest.mark.parametrize(
-    ("image", "shape", "options", "naming"),
-    [
-        (np.ones((20, 20)), (12, 10), {}, "cells of at least"),
-        (np.ones((20, 20)), (10, 10), {"pixels": 3}, "within a cell"),
-        (np.zeros((20, 20)), (10, 10), {"has_dark": True}, "no cell is illuminated"),
-        (
-            np.ones((20, 20)),
-            (10, 10),
-            {"illuminated_fraction": 2.0, "has_dark": True},
-            "illuminated_fraction",
-        ),
-        (np.ones((20, 20)), (10, 10), {"roi": (0, 0, 30, 20)}, "roi"),
-    ],
-)
-def test_known_grid_refuses_wrong_input(
-    image: NDArray[Any], shape: tuple[int, int], options: dict[str, Any], naming: str
-) -> None:
-    with pytest.raises(InputError, match=naming):
-        find_illuminated(image, shape, **options)

@@ -30,12 +30,6 @@ class TestGrid:
         assert len(layout) == len(illuminated)
         assert len(layout) == count
 
-    def test_truth_values_are_no_numbers(self) -> None:
-        for name in ("corners", "centres", "cells"):
-            values: dict[str, Any] = {"corners": [[0, 0]], name: [[1, True]]}
-            with pytest.raises(fs.InputError, match=f"layout.{name} = .*got true or false"):
-                fs.Layout((16, 16), (8, 8), **values)
-
     def test_grid_places_windows_row_by_row(self) -> None:
         layout = fs.Layout.grid((2, 3), pixels=(4, 6), pitch=(5, 8), origin=(1, 2))
         assert layout.corners.tolist() == [[1, 2], [1, 10], [1, 18], [6, 2], [6, 10], [6, 18]]
@@ -94,7 +88,7 @@ class TestLayout:
         beyond = [[[3.5, 3.5], [1e39, 3.5]], [[3.5, -21.0], [11.5, 3.5]]]
         assert_each_refused(
             partial(fs.Layout, frame_shape=(8, 16), window=(8, 8), corners=np.array([[0, 0], [0, 8]])),
-            corners=[np.empty((0, 2)), [0, 0], [[0.5, 0]], [[np.nan, 0]], [[0, 0], [0]]],
+            corners=[np.empty((0, 2)), [0, 0], [[1, True]], [[0.5, 0]], [[np.nan, 0]], [[0, 0], [0]]],
             centres=[[[1.0, 1.0]], [[1.0, np.inf], [1, 1]], *beyond],
             cells=[[[0, 0]], [[0.5, 0], [0, 1]]],
             geometry=["round"],

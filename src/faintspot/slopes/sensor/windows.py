@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
-from faintspot.base.checks import real_array
 from faintspot.base.errors import InputError
 from faintspot.slopes.sensor.detection.lenslets import LensletGrid, find_lenslets
 from faintspot.slopes.sensor.window_checks import LARGEST_WINDOW, window_size, with_stated
@@ -90,11 +89,11 @@ def find_windows(
     InputError
         If no regular array of spots is found, or no window is within the frame.
     """
-    array = _finite_or_masked("frame", frame)
     window = None if pixels is None else window_size("pixels", pixels)
-    found = find_lenslets(array, pitch_px=pitch_px, **options)
+    found = find_lenslets(frame, pitch_px=pitch_px, **options)
     grid, fitted = with_stated(found, pitch_px=pitch_px, angle_deg=angle_deg, centre=centre, fit=fit)
-    shape = (int(array.shape[-2]), int(array.shape[-1]))
+    height, width = np.shape(frame)[-2:]
+    shape = (height, width)
     middles = (grid.centres + grid.drifts)[:, ::-1]
     if window is None:
         window = _largest_window(middles, grid.pitch_px)
@@ -110,14 +109,6 @@ def find_windows(
             f"try pixels < {min(window)}"
         )
     return Windows(shape, window, corners, within, grid, fitted)
-
-
-def _finite_or_masked(name: str, value: ArrayLike) -> NDArray[np.generic]:
-    """Return a real array of two or three dimensions, which may contain NaN."""
-    array = real_array(name, value, minimum_dimensions=2)
-    if array.ndim > 3:
-        raise InputError(f"{name}: expected (h, w) or (n, h, w), got shape {array.shape}")
-    return array
 
 
 def _largest_window(middles: NDArray[np.float64], pitch_px: float) -> tuple[int, int]:

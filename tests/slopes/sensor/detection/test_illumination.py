@@ -152,12 +152,6 @@ def test_faint_spots_are_doubtful_and_bright_ones_are_not() -> None:
     assert false < 0.05 * np.count_nonzero(faint.illuminated)
 
 
-def test_two_brightnesses_are_doubtful() -> None:
-    grid = find_lenslets(Sensor(2, outside=0.45).frame())
-    assert grid.doubt
-    assert "\n" not in grid.doubt
-
-
 def test_illuminated_fraction_is_strict_and_of_the_median() -> None:
     truth = Sensor(3, lenslets=14, scatter=0.4)
     frame = truth.frame()

@@ -205,7 +205,7 @@ def test_no_lattice_is_an_error_in_one_line(image: NDArray[Any]) -> None:
     [
         ("geometry", {"geometry": "round"}),
         ("pitch_px = 2: expected 4 to", {"pitch_px": 2}),
-        ("pitch_px = 40: expected at most 31.25", {"pitch_px": 40}),
+        ("pitch_px = 40: expected 4 to 31.25", {"pitch_px": 40}),
         ("illuminated_fraction = 2", {"illuminated_fraction": 2}),
         ("bad_pixels", {"bad_pixels": np.zeros((3, 3), dtype=bool)}),
         ("bad_pixels", {"bad_pixels": np.ones((50, 60), dtype=bool)}),

@@ -176,18 +176,10 @@ def _pitch_range(pitch_px: float | None, shape: tuple[int, ...]) -> tuple[float,
     largest = min(shape) / 1.6
     if pitch_px is None:
         return SMALLEST_PITCH_PX, largest
-    pitch_px = number_between("pitch_px", pitch_px, 0.0, low_open=True)
-    if pitch_px < _SMALLEST_GIVEN_PITCH_PX:
+    if not _SMALLEST_GIVEN_PITCH_PX <= number_between("pitch_px", pitch_px) <= largest:
         raise InputError(
-            f"expected {_SMALLEST_GIVEN_PITCH_PX} to {largest:g}; spots of quad cells overlap too much to "
-            "be found, --grid of faintspot layout gives their places",
-            name="pitch_px",
-            value=pitch_px,
-        )
-    if pitch_px > largest:
-        raise InputError(
-            f"expected at most {largest:g}, two rows of lenslets must fit into {shape[1]} x {shape[0]} "
-            "pixels",
+            f"expected {_SMALLEST_GIVEN_PITCH_PX} to {largest:g}: two rows of lenslets must fit in; "
+            "of quad cells, --grid of faintspot layout gives the places",
             name="pitch_px",
             value=pitch_px,
         )
@@ -212,12 +204,10 @@ def _too_few(count: int, lattice: Lattice, pupil: PupilRegion | None) -> str:
     expected = "expected at least two rows of two"
     if pupil is not None:
         return f"{found}{count} of its lenslets lie in the pupil given, {expected}"
-    number = "none of its lenslets is" if count == 0 else f"only {count} of its lenslets {_be(count)}"
-    return f"{found}{number} lit for certain, {expected}; average more frames, or state the pitch"
-
-
-def _be(count: int) -> str:
-    return "is" if count == 1 else "are"
+    return (
+        f"{found}only {count} of its lenslets are lit for certain, {expected}; average more frames, or state "
+        "the pitch"
+    )
 
 
 def _checked(frame: object, bad_pixels: object) -> tuple[NDArray[np.generic], NDArray[np.bool_]]:
