@@ -135,10 +135,6 @@ class TestThatFail:
                 files.sync_folder(tmp_path)
 
 
-GRID = "[layout.grid]\nshape = [3, 3]\npixels = 8\n"
-SETTINGS = '[estimator]\nname = "centroid"\n'
-
-
 def of_text(text: str) -> Callable[[Path], Any]:
     def read(folder: Path) -> Any:
         path = folder / "faintspot.toml"
@@ -171,23 +167,6 @@ CASES: dict[str, tuple[Callable[[Path], Any], tuple[str, ...]]] = {
     "pitch": (lambda _: fs.Layout.grid((3, 3), pixels=8, pitch=10_000), ("frame_shape",)),
     "cells": (lambda _: with_cells([[0, 0], [1e300, 0]]), ("layout.cells = 1e+300",)),
     "map of cells": (lambda _: with_cells([[0, 0], [9999, 9999]]), ("layout.cells = 10000 x 10000",)),
-    "read noise": (
-        of_text(f"{GRID}{SETTINGS}[calibration]\nread_noise_e = 1e200\n"),
-        ("read_noise_e = 1e+200",),
-    ),
-    "gain": (of_text(f"{GRID}{SETTINGS}[calibration]\nem_gain = 1e-300\n"), ("em_gain = 1e-300",)),
-    "bad pixel": (
-        of_text(f"{GRID}{SETTINGS}[calibration]\nbad_pixels = [[1e300, 0]]\n"),
-        ("bad_pixels = 1e+300",),
-    ),
-    "auto and a number": (
-        of_text(f'{GRID}[estimator]\nname = "tv"\nnoise_std = {{ default = "auto", 3 = 2.0 }}\n'),
-        ('noise_std: expected "auto" for the whole sensor or numbers for all',),
-    ),
-    "auto in a list": (
-        of_text(f'{GRID}[estimator]\nname = "tv"\nnoise_std = ["auto", 2.0]\n'),
-        ('noise_std: expected "auto" for the whole sensor or numbers for all',),
-    ),
     "posterior of many fluxes": (
         lambda _: map_of(64, 0.5, flux_e=np.linspace(10, 1000, 16)),
         ("map: tables of the posterior", "search_range_px", "one flux_e"),
@@ -216,10 +195,6 @@ def test_it_is_refused_in_one_line(name: str, tmp_path: Path) -> None:
     make, words = CASES[name]
     with refused(*words):
         make(tmp_path)
-
-
-def test_large_grids_are_quick_enough_to_make() -> None:
-    assert len(fs.Layout.grid((300, 300), pixels=8)) == 90_000
 
 
 def test_flux_beyond_the_memory_uses_the_nearest_tables(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -10,7 +10,6 @@ from faintspot.base.errors import InputError
 from faintspot.base.statistics import (
     Estimate,
     absolute_errors,
-    magnitudes,
     mean_by_blocks,
     of_draws,
     paired_mean,
@@ -59,11 +58,6 @@ def test_standard_error_of_r_covers_the_truth() -> None:
     estimates = [slope_error(e[:, 0], e[:, 1], np.zeros((200, 2))) for e in errors]
     deviations = np.array([(e.value - np.sqrt(2 / np.pi)) / e.standard_error for e in estimates])
     assert abs(np.mean(np.abs(deviations) < 1) - 0.683) < 0.061
-
-
-def test_magnitudes_are_those_of_the_ratio() -> None:
-    assert magnitudes(100.0) == pytest.approx(5.0)
-    assert magnitudes(1.0) == 0.0
 
 
 def gained(n: int, seed: int, gain: float = 0.6, noise: float = 0.2) -> tuple[Any, Any]:

@@ -52,12 +52,6 @@ def test_files_that_are_too_large_or_have_no_end(tmp_path: Path) -> None:
     assert "expected a regular file" in refused(tmp_path / "zero.toml", None)
 
 
-def test_a_text_gives_its_tables_or_says_where_it_is_wrong() -> None:
-    assert text_files.parse_text("a = 1", "there") == {"a": 1}
-    with pytest.raises(InputError, match=r"^there: not a TOML file"):
-        text_files.parse_text("a = ", "there")
-
-
 @pytest.mark.parametrize(
     ("table", "message"),
     [
@@ -71,18 +65,6 @@ def test_unknown_and_missing_keys_are_named(table: dict[str, int], message: str)
     with pytest.raises(InputError) as error:
         text_files.check_keys("settings.", table, ("noise_std", "rule"), required=["noise_std"])
     assert str(error.value) == message
-
-
-def test_unknown_names_get_a_suggestion() -> None:
-    text_files.check_known("a.toml: ", "layout", ["layout"], "table")
-    with pytest.raises(InputError, match=r"^a\.toml: layuot: unknown table; did you mean layout\?$"):
-        text_files.check_known("a.toml: ", "layuot", (name for name in ["layout"]), "table")
-
-
-def test_what_is_no_table_is_refused() -> None:
-    assert text_files.checked_table("psf", {"a": 1}) == {"a": 1}
-    with pytest.raises(InputError, match=r"^psf: expected a table, got 'text'$"):
-        text_files.checked_table("psf", "text")
 
 
 # The page's server looks for lone surrogates, which text may hold in memory and not in a message.

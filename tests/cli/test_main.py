@@ -31,13 +31,6 @@ def test_help_fits_the_screen(
     assert text == run.ok(*([command] if command else []), "-h").out
 
 
-def test_help_lists_every_command(run: Commands) -> None:
-    text = run.ok("--help").out
-    for command in COMMANDS:
-        assert f"\n  {command} " in text
-    assert run.ok().out == text
-
-
 def test_every_option_says_what_it_is_for(run: Commands) -> None:
     for command in COMMANDS:
         found = group.get_command(click.Context(group), command)

@@ -272,13 +272,6 @@ class SlopeFormatTests(SlopeFile):
         (tmp_path / "locked").mkdir(mode=0o500)
         assert_refused(tmp_path / "locked" / name, "no permission")
 
-    def test_read_only_file_system(self, path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        def refuse(*_: Any, **__: Any) -> None:
-            raise OSError(errno.EROFS, "Read-only file system")
-
-        monkeypatch.setattr(Path, "mkdir", refuse)
-        assert_refused(path, "read-only", "choose another folder")
-
 
 class SlopeStoreTests(SlopeFile):
     """Tests of the store that a run writes first, whatever its format."""
@@ -385,13 +378,4 @@ class SlopeStoreTests(SlopeFile):
             for changes in ({}, other_run, {"overwrite": True, "resume": False}):
                 assert_refused(path, path.name, f"is being written by process {os.getpid()}", **changes)
             writer.append(20, part(result(), 20, 50))
-        assert_alone(path, result())
-
-    def test_closed_writer_takes_no_more(self, path: Path) -> None:
-        writer = writer_for(path)
-        writer.append(0, part(result(), 0, 20))
-        writer.close()
-        with refused("closed, expected no more frames, got frame 20"):
-            writer.append(20, part(result(), 20, 30))
-        write(path, result())
         assert_alone(path, result())

@@ -47,27 +47,21 @@ def own(folder: Path, images: NDArray[Any] | None = None, **attributes: Any) -> 
 
 @pytest.mark.parametrize("reference", [None, REFERENCE.tolist()])
 def test_ours_bit_for_bit(tmp_path: Path, reference: Any) -> None:
-    sensor = read_aot(own(tmp_path, reference=reference))
+    sensor: Any = read_aot(own(tmp_path, reference=reference))
     telemetry = read_telemetry(tmp_path / "night.zarr")
-    assert sensor.layout is not None
     assert fs.Layout(**sensor.layout) == LAYOUT
     assert sensor.tables == {"estimator": {"name": "tv", "noise_std": 1.5}, "settings": {"flux_e": 30.0}}
     assert (sensor.reference is None) == (reference is None)
     if reference is not None:
-        assert sensor.reference is not None
         assert np.array_equal(sensor.reference, REFERENCE)
-    assert sensor.slopes is not None
-    assert sensor.flux is not None
     assert sensor.slopes.dtype == np.float32
     assert np.array_equal(sensor.slopes[:, 0], telemetry.x)
     assert np.array_equal(sensor.slopes[:, 1], telemetry.y)
     assert np.array_equal(sensor.flux, telemetry.flux)
     assert sensor.unit == "pix"
-    assert sensor.noise is not None
     assert np.array_equal(sensor.noise[:, 0], np.square(telemetry.standard_error_x))
     assert np.array_equal(sensor.noise[:, 1], np.square(telemetry.standard_error_y))
     assert np.array_equal(sensor.noise[:, 2], telemetry.covariance_xy)
-    assert sensor.flags is not None
     assert np.array_equal(sensor.flags, telemetry.flags)
     assert np.array_equal(sensor.frame, telemetry.frame)
     assert np.array_equal(sensor.unix_time_s, telemetry.unix_time_s)
@@ -107,12 +101,10 @@ def test_values_of_a_loop(tmp_path: Path) -> None:
         loop.control_matrix.data = np.arange(256.0).reshape(32, 2, 4)
         loop.commands.data = np.arange(1600.0).reshape(50, 32)
 
-    sensor = read_aot(example(tmp_path / "e.fits", in_units_of_the_standard))
+    sensor: Any = read_aot(example(tmp_path / "e.fits", in_units_of_the_standard))
     assert sensor.pixel_scale_arcsec == pytest.approx(0.206265, rel=1e-5)
     assert (sensor.diameter_m, sensor.frame_rate_hz, sensor.delay_frames) == (4.2, 500.0, 2.5)
     assert not sensor.is_closed
-    assert sensor.control_matrix is not None
-    assert sensor.commands is not None
     np.testing.assert_array_equal(sensor.control_matrix[1], np.arange(8.0, 16.0))
     np.testing.assert_array_equal(sensor.commands[2], np.arange(64.0, 96.0))
 
@@ -200,7 +192,7 @@ def with_subapertures(system: Any) -> None:
 
 
 def test_the_example_of_aotpy(tmp_path: Path) -> None:
-    sensor = read_aot(example(tmp_path / "e.fits"))  # that with pixels
+    sensor: Any = read_aot(example(tmp_path / "e.fits"))  # that with pixels
     assert (sensor.name, sensor.n, sensor.pixels, sensor.layout, sensor.tables) == (
         "WFS1",
         4,
@@ -208,7 +200,6 @@ def test_the_example_of_aotpy(tmp_path: Path) -> None:
         None,
         {},
     )
-    assert sensor.slopes is not None
     assert (sensor.slopes.shape, sensor.unit, sensor.frame.size) == ((50, 2, 4), "", 0)
     other = read_aot(tmp_path / "e.fits", "WFS2")
     assert repr(other) == "AotSensor('WFS2', 8 sub-apertures, slopes)"
@@ -236,15 +227,12 @@ def test_layout_of_the_configuration_comes_first(tmp_path: Path) -> None:
 
 
 def test_subapertures_of_others(tmp_path: Path) -> None:
-    sensor = read_aot(example(tmp_path / "e.fits", with_subapertures))
-    assert sensor.layout is not None
+    sensor: Any = read_aot(example(tmp_path / "e.fits", with_subapertures))
     layout = fs.Layout(**sensor.layout)
     assert layout.corners.tolist() == [[7, 2], [7, 14], [1, 8], [13, 8]]
     assert (layout.window, layout.frame_shape) == ((6, 6), (20, 20))
     assert layout.cells.tolist() == [[1, 0], [1, 2], [0, 1], [2, 1]]
-    assert sensor.reference is not None
     assert np.allclose(sensor.reference, np.arange(8.0) / 10)
-    assert sensor.interaction is not None
     assert sensor.interaction.shape == (8, 3)
     assert sensor.interaction[1].tolist() == [6.0, 7.0, 8.0]  # x of the second
     assert sensor.interaction[4].tolist() == [3.0, 4.0, 5.0]  # y of the first

@@ -69,15 +69,6 @@ def test_arrays_are_read_from_every_format(tmp_path: Path, name: str, shape: tup
     np.testing.assert_array_equal(read_reference(tmp_path / name), array)
 
 
-def test_slopes_that_are_damaged(tmp_path: Path) -> None:
-    write(tmp_path / "a.zarr", result())
-    (tmp_path / "a.zarr" / "x" / "c.0.0").write_bytes(b"")
-    with pytest.raises(InputError, match=r"a\.zarr: the store is damaged: x "):
-        read_reference(tmp_path / "a.zarr")
-    with pytest.raises(InputError, match="no such file"):
-        read_reference(tmp_path / "b.zarr")
-
-
 @pytest.mark.parametrize("name", ["a" * 5000, "a\0b", "a\0b:frames"])
 def test_names_that_no_file_can_have(name: str) -> None:
     with pytest.raises(InputError, match="no such file"):

@@ -52,19 +52,6 @@ def test_tiff_of_five_channels_is_refused(tmp_path: Path) -> None:
         open_frames([tmp_path / "a.tif"])
 
 
-def test_frames_before_a_damaged_tiff_page_are_read(tmp_path: Path) -> None:
-    path = save(tmp_path / "deflated.tif", cube())
-    with tifffile.TiffFile(path) as file:
-        offset = file.pages[4].dataoffsets[0]
-    content = bytearray(path.read_bytes())
-    content[offset : offset + 20] = bytes(20)
-    path.write_bytes(content)
-    with open_frames([path]) as source:
-        np.testing.assert_array_equal(source.block(0, 4), cube()[:4])
-        with refused("deflated.tif: frames 4 to 6 (counted from 0) cannot be read"):
-            source.block(4, 7)
-
-
 @pytest.mark.parametrize("compression", ["tiff_lzw", "packbits"])
 @pytest.mark.parametrize("kind", ["u1", "u2", "i4", "f4"])
 def test_tiff_that_pillow_decodes(

@@ -37,13 +37,6 @@ def test_arrays_that_are_no_frames(
         open_frames([path])
 
 
-def test_big_endian_becomes_native(tmp_path: Path) -> None:
-    np.save(tmp_path / "a.npy", cube().astype(">i2"))
-    with open_frames([tmp_path / "a.npy"]) as source:
-        assert source.dtype.isnative
-        np.testing.assert_array_equal(source.block(0, 11), cube())
-
-
 def test_negative_shape_is_refused(tmp_path: Path) -> None:
     """Two negative sides make a size that a file can have."""
     with (tmp_path / "a.npy").open("wb") as file:

