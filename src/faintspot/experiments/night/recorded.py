@@ -63,8 +63,6 @@ class RecordedNight:
     """(methods,): frames at the beginning of a turn that are not scored."""
     turns: int
     turns_in_block: int
-    frames: int
-    """Scored frames."""
     is_measured: bool
     """Whether Strehl ratios were measured, not estimated from slopes."""
     shared_phase_error_rad2: Floats
@@ -165,7 +163,7 @@ def _night(
     source: str,
     wavelength_m: float,
 ) -> RecordedNight:
-    settle = [settle_frames or methods.settle_frames(number) for number in range(len(methods.labels))]
+    settle = [settle_frames or frames for frames in methods.settle_frames]
     turns = turns_of(loop, settle)
     _check(loop, turns, methods, settle)
     relative = relative_gains(loop, turns, methods.groups, methods.reference)
@@ -208,11 +206,8 @@ def _night(
         configuration="",
         **arrays,
     )
-    return RecordedNight(
-        night, relative, stated, tuple(settle), len(kept), together,
-        sum(scored.turn.end - scored.turn.scored for scored in kept), strehl is not None, shared_phase,
-        methods.leaning,
-    )  # fmt: skip
+    made = len(kept), together, strehl is not None, shared_phase, methods.leaning
+    return RecordedNight(night, relative, stated, tuple(settle), *made)
 
 
 def _check(
@@ -335,8 +330,10 @@ _TEXT = Texts("faintspot.experiments.night")
 
 def page_of_recording(recorded: RecordedNight) -> Report:
     """Return the page of a night, with its residual phase and how its blocks were made."""
-    page = night_page(recorded.night)
-    return replace(page, sections=[*page.sections, _phase_section(recorded), _blocks_section(recorded)])
+    night, page = recorded.night, night_page(recorded.night)
+    phase = _TEXT.table("phase", phase_differences(recorded), reference=night.labels[night.reference])
+    sections = [*page.sections, _TEXT.section("phase", phase), _blocks_section(recorded)]
+    return replace(page, sections=sections)
 
 
 def summary_of_recording(recorded: RecordedNight) -> dict[str, object]:
@@ -356,7 +353,6 @@ def summary_of_recording(recorded: RecordedNight) -> dict[str, object]:
         "settle_frames": dict(zip(night.labels, recorded.settle_frames, strict=True)),
         "turns": recorded.turns,
         "cycles_in_block": recorded.turns_in_block,
-        "scored_frames": recorded.frames,
         "remarks": _remarks(recorded),
     }
 
@@ -370,12 +366,6 @@ def phase_differences(recorded: RecordedNight) -> list[Difference]:
     """Return the residual phase variance of each group minus that of the reference [rad^2]."""
     night = recorded.night
     return differences(replace(night, strehl=night.phase_rad2, shared_error=recorded.shared_phase_error_rad2))
-
-
-def _phase_section(recorded: RecordedNight) -> Section:
-    night = recorded.night
-    table = _TEXT.table("phase", phase_differences(recorded), reference=night.labels[night.reference])
-    return _TEXT.section("phase", table)
 
 
 def _blocks_section(recorded: RecordedNight) -> Section:

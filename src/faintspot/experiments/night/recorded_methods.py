@@ -15,7 +15,6 @@ from faintspot.io.frames import read_array
 from faintspot.io.telemetry import Telemetry
 from faintspot.loop.control.base import CONTROLS, INTEGRATOR, KALMAN, split_control
 from faintspot.loop.control.configuration import RecordedControl
-from faintspot.loop.control.options import ControlOptions
 from faintspot.loop.telemetry.recording import CLOSED
 from faintspot.slopes.estimators.registry import estimators
 from faintspot.slopes.pipeline.settings import option_names
@@ -43,10 +42,11 @@ class RecordedMethods:
     number: NDArray[np.int64]
     """Index into labels for each number in telemetry; -1: not in a closed loop."""
     reference: int
-    controllers: tuple[str, ...]
-    options: ControlOptions
-    least_gain: float
-    """Smallest loop gain of the recording."""
+    settle_frames: tuple[int, ...]
+    """Frames of each turn in which the method before still counts: for filters, which begin anew,
+    100; for integrators the delay, and three times one over the smallest loop gain of the recording."""
+    centroid_gain: float
+    """Stated in [control]."""
 
     @classmethod
     def of(cls, telemetry: Telemetry, control: RecordedControl) -> RecordedMethods:
@@ -71,6 +71,8 @@ class RecordedMethods:
             for change in telemetry.changes
             if isinstance(change.get("changes", {}).get(_GAIN), int | float)
         ]
+        least_gain = max(min([control.options.gain, *gains]), 1e-3)
+        of_integrator = int(control.options.delay_frames) + math.ceil(_TIMES / least_gain)
         return cls(
             labels,
             tuple(f"{_in_words(part)}; {CONTROLS[kind]}" for part, kind in parts),
@@ -79,25 +81,9 @@ class RecordedMethods:
             tuple(predicted),
             number,
             labels.index(_NONE) if _NONE in labels else 0,
-            tuple(kind for _, kind in parts),
-            control.options,
-            max(min([control.options.gain, *gains]), 1e-3),
+            tuple(of_integrator if kind == INTEGRATOR else _FILTER_FRAMES for _, kind in parts),
+            float(control.options.centroid_gain),
         )
-
-    @property
-    def centroid_gain(self) -> float:
-        """Centroid gain that [control] states."""
-        return float(self.options.centroid_gain)
-
-    def settle_frames(self, method: int) -> int:
-        """Return the frames at the beginning of a turn in which the method before still counts.
-
-        For integrators: the delay, and three times one over the smallest loop gain of the recording. For
-        filters, which begin anew with each turn: 100.
-        """
-        if self.controllers[method] != INTEGRATOR:
-            return _FILTER_FRAMES
-        return int(self.options.delay_frames) + math.ceil(_TIMES / self.least_gain)
 
 
 def conditions_of(telemetry: Telemetry) -> tuple[NDArray[np.int64], list[str]]:
