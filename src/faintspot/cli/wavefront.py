@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -27,10 +28,12 @@ from faintspot.slopes.wavefront.files import (
     mode_table,
     remarks,
 )
-from faintspot.slopes.wavefront.fit import NM, total
+from faintspot.slopes.wavefront.fit import total
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+_WIDEST_HEADING = 12  # of numbers, characters
 
 
 @click.command(cls=SectionedCommand)
@@ -178,9 +181,11 @@ def _print(tables: list[tuple[list[str], list[list[str]]]], wavefront: Wavefront
         table = Table(box=None, pad_edge=False)
         words = 2 if header[0] == "Noll" else 1
         for place, title in enumerate(header):
-            text = place < words
-            kept = text and wavefront.unit == NM  # the unit of pixels needs the space
-            table.add_column(title, justify="left" if text else "right", no_wrap=kept)
+            if place < words:
+                table.add_column(title)
+            else:  # its heading is folded, so that no digit is cut off
+                folded = textwrap.fill(title, _WIDEST_HEADING, break_long_words=False)
+                table.add_column(folded, justify="right", no_wrap=True)
         for row in rows:
             table.add_row(*row)
         console.print(table)
