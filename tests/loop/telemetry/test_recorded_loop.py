@@ -150,7 +150,7 @@ def test_the_command_writes_a_page_and_its_numbers(
 def small() -> dict[str, Any]:
     """Arrays and numbers of a recording of four sub-apertures."""
     slopes = np.random.default_rng(1).standard_normal((20, 8))
-    return {"slopes": slopes, "slope_unit": "px", "frame_rate_hz": 250.0}
+    return {"slopes": slopes, "commands": slopes[:, :3], "slope_unit": "px", "frame_rate_hz": 250.0}
 
 
 COLUMN = np.arange(20)[:, None]
@@ -161,9 +161,9 @@ WRONG: list[tuple[str, Any, str]] = [
     ("frame", COLUMN + 0.5, "whole number"),
     ("frame", COLUMN * 1j, "real numbers"),
     ("slopes", 3.0, "dimensions"),
-    ("slopes", np.zeros((9, 7)), "expected shape"),
+    ("slopes", np.zeros((20, 9)), "expected shape"),
     ("commands", np.zeros((7, 36)), "20 frames"),
-    ("interaction_matrix", np.ones((8, 35)), "expected"),
+    ("interaction_matrix", np.ones((8, 2)), r"expected shape \(8, 3\)"),
     ("time_s", np.zeros(20), "20 increasing numbers"),
     ("flags", np.zeros((20, 3), int), "shape"),
     ("slope", 1.0, "did you mean slopes"),
