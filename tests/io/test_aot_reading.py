@@ -20,7 +20,7 @@ import faintspot as fs
 from faintspot.engine.telemetry.recorder import TelemetryStore
 from faintspot.io import open_frames, read_aot, read_slopes, read_telemetry, write_aot
 from faintspot.slopes.pipeline import configuration
-from faintspot.slopes.recorded import measure_recorded
+from faintspot.slopes.recorded.measuring import measure_recorded
 
 aotpy: Any = pytest.importorskip("aotpy")
 pytestmark = pytest.mark.filterwarnings("ignore:.AOT_")
@@ -118,14 +118,14 @@ def test_ours_is_measured_as_it_was(tmp_path: Path, run: Commands, monkeypatch: 
     path = own(tmp_path, images, settings=configuration.to_text(settings), reference=REFERENCE.tolist())
     monkeypatch.chdir(tmp_path)
     out = run.ok("slopes", "night.fits", "-o", "slopes.npz").out
-    assert "sub-apertures, reference slopes and settings of night.fits" in out
+    assert "sub-apertures, reference slopes, settings of night.fits" in out
     expected = fs.SlopePipeline(LAYOUT, settings, reference=REFERENCE)(images["raw"])
     stored = read_slopes(tmp_path / "slopes.npz")
     assert np.array_equal(stored.variables["x"], expected.x)
     assert np.array_equal(stored.variables["y"], expected.y)
     fs.Settings("centroid").save(tmp_path / "faintspot.toml")
     out = run.ok("slopes", path, "-o", "centroids.npz").out
-    assert f"sub-apertures and reference slopes of {path}" in out
+    assert f"sub-apertures, reference slopes of {path}" in out
     centroids = fs.SlopePipeline(LAYOUT, fs.Settings("centroid"), reference=REFERENCE)(images["raw"])
     assert np.array_equal(read_slopes(tmp_path / "centroids.npz").variables["x"], centroids.x)
 

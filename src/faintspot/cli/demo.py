@@ -21,7 +21,7 @@ from faintspot.io.slopes import read_slopes
 from faintspot.slopes.pipeline import configuration
 from faintspot.slopes.pipeline.slope_pipeline import SlopePipeline
 from faintspot.slopes.pipeline.slopes import Slopes
-from faintspot.slopes.recorded import measure_recorded
+from faintspot.slopes.recorded.measuring import measure_recorded
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -14,7 +14,7 @@ from faintspot.cli.output import progress_bar
 from faintspot.io.file_format import UNITS
 from faintspot.io.frames import slope_format
 from faintspot.io.stored_array import split_location
-from faintspot.slopes.recorded import Summary, measure_recorded
+from faintspot.slopes.recorded.measuring import Summary, measure_recorded
 
 
 @click.command()

@@ -143,7 +143,7 @@ def read_slopes(path: str | Path, *, unit: str = "px") -> StoredSlopes:
     --------
     >>> import numpy as np, faintspot as fs
     >>> from faintspot.io import read_slopes
-    >>> from faintspot.slopes.recorded import measure_recorded
+    >>> from faintspot.slopes.recorded.measuring import measure_recorded
     >>> fs.Layout.grid((4, 4), pixels=8).save("faintspot.toml")
     >>> fs.Settings("centroid").save("faintspot.toml")
     >>> np.save("frames.npy", np.ones((5, 32, 32)))

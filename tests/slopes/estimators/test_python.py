@@ -15,7 +15,7 @@ from tests.refusals import refused
 import faintspot as fs
 from faintspot.slopes.estimators import Estimator, Positions, estimators, register
 from faintspot.slopes.estimators.registry import restore
-from faintspot.slopes.recorded import measure_recorded
+from faintspot.slopes.recorded.measuring import measure_recorded
 
 LAYOUT = fs.Layout.grid((2, 3), pixels=8)
 BRIGHT = 1000.0

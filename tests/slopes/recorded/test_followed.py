@@ -12,7 +12,7 @@ from tests.slopes.recorded.recorded_cases import Page
 import faintspot as fs
 from faintspot.io import read_slopes
 from faintspot.slopes.pipeline import configuration
-from faintspot.slopes.recorded import measure_recorded
+from faintspot.slopes.recorded.measuring import measure_recorded
 from faintspot.slopes.recorded.stored import report_of_stored
 
 pytestmark = pytest.mark.usefixtures("undrawn_pictures")

@@ -10,7 +10,7 @@ from tests.cli.cli_cases import CONFIGURATION, LAYOUT, assert_equal, expected, s
 import faintspot
 from faintspot import InputError
 from faintspot.io import read_slopes
-from faintspot.slopes.recorded import measure_recorded
+from faintspot.slopes.recorded.measuring import measure_recorded
 
 
 @pytest.fixture

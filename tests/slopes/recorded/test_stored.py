@@ -16,7 +16,7 @@ from faintspot.slopes.camera.calibration import Calibration
 from faintspot.slopes.pipeline import configuration
 from faintspot.slopes.pipeline.settings import Settings
 from faintspot.slopes.pipeline.slope_pipeline import SlopePipeline
-from faintspot.slopes.recorded import measure_recorded
+from faintspot.slopes.recorded.measuring import measure_recorded
 from faintspot.slopes.recorded.stored import report_of_stored
 from faintspot.slopes.sensor.layout import Layout
 from faintspot.slopes.spots.psf import PSF

@@ -205,7 +205,7 @@ def method_numbers(run: SlopesRun, index: int) -> dict[str, object]:
         "gain": centroid_gain,
         "noise": noise,
         "noise_arcsec": None if scale is None else noise * scale,
-        "relative_gain": gain if ranked else None,
+        "relative_gain": (gain if gain.standard_error else Estimate(1.0)) if ranked else None,
         "noise_at_equal_gain": median(run.equal_noise_px(index)) if ranked else None,
         "stated_error": method.stated_error_px,
         "jitter": median(run.jitters[index]),

@@ -148,15 +148,14 @@ def configured(
     parts: dict[str, Any] = {"layout": layout}
     if described is None:
         if not sensor.tables:
-            command = _layout_command(frames[0], layout, path)
+            command = shlex.join(["faintspot", "layout", str(frames[0]), "-o", str(path)])
             raise InputError(f"{path}: no such file, and {first[0]} has no settings; `{command}` makes one")
         words.append("settings")
         if sensor.parts is not None:
             stored = configuration.unpacked(sensor.parts)
             parts |= dict(zip(("calibration", "psf", "score"), stored, strict=True))
     tables = sensor.tables if described is None else described.tables
-    listed = " and ".join([", ".join(words[:-1]), words[-1]]) if len(words) > 1 else words[0]
-    return Configuration(path, tables, **parts), f"{listed} of {first[0]}", sensor.reference
+    return Configuration(path, tables, **parts), f"{', '.join(words)} of {first[0]}", sensor.reference
 
 
 def _aot_file(frames: Sequence[str | Path]) -> tuple[Path, str | None] | None:
@@ -168,16 +167,6 @@ def _aot_file(frames: Sequence[str | Path]) -> tuple[Path, str | None] | None:
     except InputError:  # whoever opens it says so, after what is wrong with the configuration
         return None
     return first if is_aot(first[0]) else None
-
-
-def _layout_command(frames: str | Path, layout: Layout, path: str | Path) -> str:
-    """Return the command that writes a configuration for a layout whose cells are on a grid."""
-    rows, columns = np.ptp(layout.cells, axis=0) + 1
-    (top, left), (bottom, right) = layout.corners.min(axis=0), layout.corners.max(axis=0) + layout.window
-    is_whole = (top, left, bottom, right) == (0, 0, *layout.frame_shape)
-    roi = [] if is_whole else ["--roi", f"{left},{top},{right},{bottom}"]
-    words = ["faintspot", "layout", str(frames), "--grid", f"{rows}x{columns}", *roi, "-o", str(path)]
-    return shlex.join(words)
 
 
 _STEP_PX = 0.25
