@@ -148,7 +148,7 @@ def configured(
     parts: dict[str, Any] = {"layout": layout}
     if described is None:
         if not sensor.tables:
-            command = shlex.join(["faintspot", "layout", str(frames[0]), "-o", str(path)])
+            command = _layout_command(frames[0], layout, path)
             raise InputError(f"{path}: no such file, and {first[0]} has no settings; `{command}` makes one")
         words.append("settings")
         if sensor.parts is not None:
@@ -167,6 +167,16 @@ def _aot_file(frames: Sequence[str | Path]) -> tuple[Path, str | None] | None:
     except InputError:  # whoever opens it says so, after what is wrong with the configuration
         return None
     return first if is_aot(first[0]) else None
+
+
+def _layout_command(frames: str | Path, layout: Layout, path: str | Path) -> str:
+    """Return the command that writes a configuration for a layout whose cells are on a grid."""
+    rows, columns = np.ptp(layout.cells, axis=0) + 1
+    (top, left), (bottom, right) = layout.corners.min(axis=0), layout.corners.max(axis=0) + layout.window
+    is_whole = (top, left, bottom, right) == (0, 0, *layout.frame_shape)
+    roi = [] if is_whole else ["--roi", f"{left},{top},{right},{bottom}"]
+    words = ["faintspot", "layout", str(frames), "--grid", f"{rows}x{columns}", *roi, "-o", str(path)]
+    return shlex.join(words)
 
 
 _STEP_PX = 0.25
