@@ -105,9 +105,9 @@ def flag_dark(test: Any, frames: Any, slopes: Any, scratch: Any) -> None:
                 _make_dark(f, s, slopes)
 
 
-def scratch_size(n: int, ny: int, nx: int) -> int:
-    """Return the number of float32 numbers that `flag_dark` and `flag_doubtful` need."""
-    return max(2 * SAMPLED + 2 * ny * nx + 4 * MOST_LANES + ny, n)
+def scratch_size(ny: int, nx: int) -> int:
+    """Return the number of float32 numbers that `flag_dark` and `significances` need."""
+    return 2 * SAMPLED + 2 * ny * nx + 4 * MOST_LANES + ny
 
 
 @compiled
@@ -119,22 +119,23 @@ def _typical_flux(flux: Any, flags: Any, scratch: Any) -> Any:
     n = flux.shape[0]
     sampled = min(n, SAMPLED)
     first = sampled // 16
-    kept, most = 0, min(first + GAUGES, sampled)
-    for i in range(sampled):
-        s = i * n // sampled
-        if flags[s] & _UNMEASURED or not flux[s] > 0.0:
-            continue
-        place = kept
-        if kept == most:
-            place = most - 1
-            if not flux[s] > flux[int(scratch[place])]:
-                continue
-        else:
-            kept += 1
-        while place > 0 and flux[s] > flux[int(scratch[place - 1])]:
-            scratch[place] = scratch[place - 1]
-            place -= 1
-        scratch[place] = s
+    kept, most, least = 0, min(first + GAUGES, sampled), np.float32(0.0)
+    step, rest = n // sampled, n % sampled
+    s = part = 0
+    for _ in range(sampled):
+        here = flux[s]
+        if here > least and not flags[s] & _UNMEASURED:
+            kept = min(kept + 1, most)
+            place = kept - 1
+            while place > 0 and here > scratch[SAMPLED + place - 1]:
+                scratch[place], scratch[SAMPLED + place] = scratch[place - 1], scratch[SAMPLED + place - 1]
+                place -= 1
+            scratch[place], scratch[SAMPLED + place] = s, here
+            if kept == most:
+                least = scratch[SAMPLED + most - 1]
+        s, part = s + step, part + rest  # s is i * n // sampled
+        if part >= sampled:
+            s, part = s + 1, part - sampled
     if kept <= first:
         return np.float32(-1.0)
     for i in range(kept - first):

@@ -6,8 +6,20 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from faintspot.base.flags import INVALID, UNMEASURED, SubapertureFlag
-from faintspot.slopes.kernels.compiling import compiled, inlined
+from faintspot.slopes.kernels.compiling import compiled
 from faintspot.slopes.kernels.dark import flag_dark
+from faintspot.slopes.kernels.host import WIDTHS
+from faintspot.slopes.kernels.simd import (
+    any_lane,
+    gathered,
+    load,
+    minimum,
+    select,
+    splat,
+    square_root,
+    store,
+    width_of,
+)
 
 _UNMEASURED, _INVALID = int(UNMEASURED), int(INVALID)
 UNLIKE_NEIGHBOURS = int(SubapertureFlag.UNLIKE_NEIGHBOURS)
@@ -30,18 +42,25 @@ _SURELY = 4.0
 class Expected(NamedTuple):
     """Expected positions of the spots."""
 
+    lanes: Any
+    """Lanes: W sub-apertures at once."""
     zero: Any
     """(2, n) float32: reference positions x and y, px from the windows' middles."""
     edge: Any
     """(2, n) float32: how far from its window's middle a spot is whole, px; infinite where not checked."""
     lines: Any
-    """(n, m, 2) int64: two sub-apertures in line with each, n where there is none; see `outside`."""
-    outside: Any
-    """(n, m) bool: whether both are on the same side, the nearer one first, rather than opposite."""
+    """(m, 2, p) int32: two sub-apertures in line with each, n where there is none; see `lines_of`."""
+    far: Any
+    """(m, p) float32: weight of the second one; NaN where there is none."""
     behind: Any
     """(n, m, 2) int64: a neighbour of each and the one behind it, n where there is none; m may be 0."""
     least: Any
     """Smaller differences from a line never count, px."""
+
+
+def doubtful_scratch_size(n: int) -> int:
+    """Return the number of float32 numbers that `flag_doubtful` needs."""
+    return 4 * (n + 2 * max(WIDTHS))
 
 
 @compiled
@@ -52,70 +71,106 @@ def check_slopes(test: Any, frames: Any, slopes: Any, expected: Any, scratch: An
 
 
 @compiled
-def flag_doubtful(x: Any, y: Any, flux: Any, flags: Any, expected: Any, differences: Any) -> None:
+def flag_doubtful(x: Any, y: Any, flux: Any, flags: Any, expected: Any, scratch: Any) -> None:
     """Add AT_SEARCH_LIMIT and UNLIKE_NEIGHBOURS to the flags of measured slopes, each (n_frames, n).
 
-    Displacements that change evenly from one neighbour to the next are alike. `differences` is scratch, at
-    least n numbers of float32.
+    Displacements that change evenly from one neighbour to the next are alike. `scratch` has at least
+    `doubtful_scratch_size` numbers of float32.
     """
-    zero, edge, n = expected.zero, expected.edge, x.shape[1]
+    zero, edge, n, padded = expected.zero, expected.edge, x.shape[1], expected.far.shape[1]
+    at_x, at_y, rest = scratch[: padded + 1], scratch[padded + 1 : 2 * padded + 2], scratch[2 * padded + 2 :]
     for f in range(x.shape[0]):
         for s in range(n):
             cut = (abs(x[f, s] + zero[0, s]) > edge[0, s]) | (abs(y[f, s] + zero[1, s]) > edge[1, s])
             unmeasured = (flags[f, s] & np.uint8(_UNMEASURED)) != 0
             flags[f, s] |= np.uint8(AT_SEARCH_LIMIT) if cut & (not unmeasured) else np.uint8(0)
-        is_suspect = False
         for s in range(n):
-            if not flags[f, s] & _UNMEASURED and _is_suspect(f, s, x, y, flags, expected):
-                is_suspect = True
-                break
-        if is_suspect:  # seldom, and only then all lines of all spots are needed
-            _compare(f, x, y, flux, flags, expected, differences)
+            unmeasured = (flags[f, s] & np.uint8(_UNMEASURED)) != 0
+            at_x[s] = np.float32(math.nan) if unmeasured else x[f, s]
+            at_y[s] = np.float32(math.nan) if unmeasured else y[f, s]
+        for s in range(n, padded + 1):
+            at_x[s] = at_y[s] = math.nan
+        if _is_any_suspect(at_x, at_y, expected):  # only then all lines of all spots are needed
+            _compare(f, x, y, flux, flags, expected, at_x, at_y, rest)
 
 
 @compiled
-def _is_suspect(f: Any, s: Any, x: Any, y: Any, flags: Any, expected: Any) -> Any:
-    """Return whether a slope may differ from each of its lines by more than the difference that counts."""
-    lines, found = expected.lines, False
-    like = np.float32(0.99) * expected.least * expected.least
-    for k in range(lines.shape[1]):
-        a, b = lines[s, k, 0], lines[s, k, 1]
-        if a == x.shape[1]:
+def _away(lanes: Any, first: Any, at_x: Any, at_y: Any, expected: Any, enough: Any) -> Any:
+    """Return the squared differences of W slopes from the most similar of their lines; infinite without one.
+
+    The first ones are divided by their variance for slopes of error 1, the second ones are in px^2. Lines are
+    looked at until no second one is `enough` or more.
+    """
+    one, here_x, here_y = splat(lanes, 1.0), load(lanes, at_x, first), load(lanes, at_y, first)
+    square = least = splat(lanes, math.inf)
+    for k in range(expected.far.shape[0]):
+        place = 2 * k * expected.far.shape[1] + first
+        behind = place + expected.far.shape[1]
+        far = load(lanes, expected.far, k * expected.far.shape[1] + first)
+        if not any_lane(far <= one):
             break
-        if (flags[f, a] | flags[f, b]) & _UNMEASURED:
-            continue
-        if _away(f, s, k, x, y, expected)[0] < like:
-            return False
-        found = True
-    return found
+        near = one - far
+        away_x = here_x - near * gathered(lanes, at_x, expected.lines, place)
+        away_y = here_y - near * gathered(lanes, at_y, expected.lines, place)
+        away_x = away_x - far * gathered(lanes, at_x, expected.lines, behind)
+        away_y = away_y - far * gathered(lanes, at_y, expected.lines, behind)
+        away = away_x * away_x + away_y * away_y
+        square = minimum(away / (one + near * near + far * far), square)
+        least = minimum(away, least)
+        if not any_lane(least >= enough):
+            break
+    return square, least
 
 
 @compiled
-def _compare(f: Any, x: Any, y: Any, flux: Any, flags: Any, expected: Any, differences: Any) -> None:
+def _is_any_suspect(at_x: Any, at_y: Any, expected: Any) -> Any:
+    """Return whether a slope may differ from each of its lines by more than the difference that counts."""
+    lanes, width = expected.lanes, width_of(expected.lanes)
+    like = splat(lanes, np.float32(0.99) * expected.least * expected.least)
+    infinite, zero = splat(lanes, math.inf), splat(lanes, 0.0)
+    for first in range(0, expected.far.shape[1], width):
+        least = _away(lanes, first, at_x, at_y, expected, like)[1]
+        if any_lane(select(least < infinite, least, zero) >= like):
+            return True
+    return False
+
+
+@compiled
+def _compare(
+    f: Any, x: Any, y: Any, flux: Any, flags: Any, expected: Any, at_x: Any, at_y: Any, scratch: Any
+) -> None:
     """Compare the slopes of a frame with their lines, and flag those unlike all their neighbours."""
-    n, largest, other_flux = x.shape[1], np.float32(0.0), 0
-    for s in range(n):
-        differences[s] = -1.0
-        if flags[f, s] & _UNMEASURED:
-            continue
-        differences[s], least = _difference(f, s, x, y, flags, expected)
-        if least > expected.least:
-            largest = max(largest, differences[s])
-            other_flux += _has_other_flux(f, s, flux, flags, expected)
+    lanes, width = expected.lanes, width_of(expected.lanes)
+    n, padded, largest, other_flux = x.shape[1], expected.far.shape[1], np.float32(0.0), 0
+    differences, least_px = scratch[:padded], scratch[padded : 2 * padded]
+    infinite, zero, none = splat(lanes, math.inf), splat(lanes, 0.0), splat(lanes, -1.0)
+    counts = splat(lanes, expected.least)
+    for first in range(0, padded, width):
+        square, least = _away(lanes, first, at_x, at_y, expected, none)
+        is_one = square < infinite
+        least = square_root(select(is_one, least, zero))
+        store(differences, first, select(is_one, square_root(square), none))
+        store(least_px, first, least)
+        if any_lane(least > counts):
+            for s in range(first, min(first + width, n)):
+                if least_px[s] > expected.least:
+                    largest = max(largest, differences[s])
+                    other_flux += _has_other_flux(f, s, flux, flags, expected)
     if other_flux > 0 or _exceeds(differences, n, np.float32(1.0 / TYPICAL) * largest):
-        _flag_unlike(f, x, y, flux, flags, expected, differences)
+        _flag_unlike(f, x, y, flux, flags, expected, differences, least_px)
 
 
 @compiled
-def _flag_unlike(f: Any, x: Any, y: Any, flux: Any, flags: Any, expected: Any, differences: Any) -> None:
+def _flag_unlike(
+    f: Any, x: Any, y: Any, flux: Any, flags: Any, expected: Any, differences: Any, least_px: Any
+) -> None:
     """Add UNLIKE_NEIGHBOURS to the flags of a frame; take it from spots whose neighbours were wrong."""
     n = x.shape[1]
     median = _median(differences, n)
     for s in range(n):
-        if not differences[s] > SUSPECT * median:
+        if not (differences[s] > SUSPECT * median and least_px[s] > expected.least):
             continue
-        is_far = differences[s] > TYPICAL * median or _has_other_flux(f, s, flux, flags, expected)
-        if is_far and _difference(f, s, x, y, flags, expected)[1] > expected.least:
+        if differences[s] > TYPICAL * median or _has_other_flux(f, s, flux, flags, expected):
             flags[f, s] |= UNLIKE_NEIGHBOURS
     for s in range(n):
         if not flags[f, s] & UNLIKE_NEIGHBOURS or _has_other_flux(f, s, flux, flags, expected):
@@ -137,9 +192,9 @@ def _has_other_flux(f: Any, s: Any, flux: Any, flags: Any, expected: Any) -> Any
         return False
     lines, n, own = expected.lines, flux.shape[1], flux[f, s]
     brightest, dimmest = np.float32(0.0), np.float32(math.inf)
-    for k in range(lines.shape[1]):
+    for k in range(lines.shape[0]):
         for i in range(2):
-            other = lines[s, k, i]
+            other = lines[k, i, s]
             if other < n and not flags[f, other] & _UNMEASURED:
                 brightest, dimmest = max(brightest, flux[f, other]), min(dimmest, flux[f, other])
                 if _GHOST * dimmest <= own <= _SECOND_SPOT * brightest:
@@ -196,36 +251,3 @@ def _median(values: Any, n: Any) -> Any:
         else:
             most = middle
     return most
-
-
-@compiled
-def _difference(f: Any, s: Any, x: Any, y: Any, flags: Any, expected: Any) -> Any:
-    """Return how much a slope differs from the most similar of its lines, for comparison and in px.
-
-    For comparison, it is divided by its error for slopes of error 1; -1 without a line.
-    """
-    lines, n = expected.lines, x.shape[1]
-    square = least = np.float32(math.inf)
-    for k in range(lines.shape[1]):
-        a, b = lines[s, k, 0], lines[s, k, 1]
-        if a == n:
-            break
-        if (flags[f, a] | flags[f, b]) & _UNMEASURED:
-            continue
-        away, variance = _away(f, s, k, x, y, expected)
-        square, least = min(square, away / variance), min(least, away)
-    if square == math.inf:
-        return np.float32(-1.0), np.float32(0.0)
-    return np.float32(math.sqrt(square)), np.float32(math.sqrt(least))
-
-
-@inlined
-def _away(f: Any, s: Any, k: Any, x: Any, y: Any, expected: Any) -> Any:
-    """Return the squared difference of a slope from a line, and its variance for slopes of error 1."""
-    a, b = expected.lines[s, k, 0], expected.lines[s, k, 1]
-    near, far, variance = np.float32(0.5), np.float32(0.5), np.float32(1.5)
-    if expected.outside[s, k]:
-        near, far, variance = np.float32(2.0), np.float32(-1.0), np.float32(6.0)
-    away_x = x[f, s] - near * x[f, a] - far * x[f, b]
-    away_y = y[f, s] - near * y[f, a] - far * y[f, b]
-    return away_x * away_x + away_y * away_y, variance

@@ -215,6 +215,26 @@ def _load_widened(context: Any, builder: Any, data: Any, place: Any, kind: Any, 
 
 
 @intrinsic
+def gathered(typing_context: Any, lanes: Any, array: Any, places: Any, offset: Any) -> Any:
+    """Load W elements of a contiguous array from the places that `places` has from element `offset`."""
+    vector = Vector(lanes.scalar, lanes.width)
+
+    def emit(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        data, first = (context.make_array(sig.args[k])(context, builder, args[k]).data for k in (1, 2))
+        start = builder.gep(first, [context.cast(builder, args[3], sig.args[3], types.intp)])
+        values = ir.Constant(_llvm_vector(vector), ir.Undefined)
+        for lane in range(lanes.width):
+            place = builder.load(builder.gep(start, [ir.IntType(64)(lane)]))
+            place = context.cast(builder, place, sig.args[2].dtype, types.intp)
+            values = builder.insert_element(
+                values, builder.load(builder.gep(data, [place])), ir.IntType(32)(lane)
+            )
+        return values
+
+    return vector(lanes, array, places, offset), emit
+
+
+@intrinsic
 def store(typing_context: Any, array: Any, offset: Any, value: Any) -> Any:
     """Store W consecutive elements of a contiguous array, from element `offset`."""
 

@@ -14,7 +14,7 @@ from faintspot.base.flags import UNMEASURED, SubapertureFlag, scaled_positions
 from faintspot.base.statistics import MAD_TO_STD
 from faintspot.slopes.camera.calibration import Calibration, binned
 from faintspot.slopes.estimators.base import Estimator
-from faintspot.slopes.kernels.doubtful import flag_doubtful
+from faintspot.slopes.kernels.doubtful import doubtful_scratch_size, flag_doubtful
 from faintspot.slopes.pipeline.light import MeanLight
 from faintspot.slopes.pipeline.settings import Settings
 from faintspot.slopes.pipeline.slope_pipeline import SlopePipeline
@@ -272,7 +272,7 @@ class SpotFollower:
         expected = self.pipeline.plan.expected
         anywhere = expected._replace(edge=np.full_like(expected.edge, np.inf))
         arrays = (np.ascontiguousarray(array[None]) for array in (x, y, flux))
-        flag_doubtful(*arrays, flags[None], anywhere, np.empty(len(flags), np.float32))
+        flag_doubtful(*arrays, flags[None], anywhere, np.empty(doubtful_scratch_size(len(flags)), np.float32))
 
     def _crossing(self, spots: Complex, used: NDArray[np.bool_] | None = None) -> NDArray[np.bool_]:
         """Return which of the used spots are so near to each other that they cannot be told apart."""

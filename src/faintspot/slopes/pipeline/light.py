@@ -81,7 +81,7 @@ class MeanLight:
         any value.
         """
         frames = np.ascontiguousarray(mean, np.float32)[None]
-        scratch = np.empty(scratch_size(self._n, *self._window), np.float32)
+        scratch = np.empty(scratch_size(*self._window), np.float32)
         largest, found = np.zeros(self._n, np.float32), np.empty(self._n, np.float32)
         for test in self._tests:
             significances(test, frames, found, scratch)

@@ -16,6 +16,7 @@ from faintspot.slopes.kernels import groups
 from faintspot.slopes.kernels.compiling import Direct
 from faintspot.slopes.kernels.doubtful import Expected
 from faintspot.slopes.kernels.groups import Scratch, SlopeArrays, Source, Task
+from faintspot.slopes.kernels.host import lanes_for
 from faintspot.slopes.pipeline.settings import Settings, spot_fwhm_px
 from faintspot.slopes.pipeline.slopes import RESULT_TYPES, Slopes
 from faintspot.slopes.sensor.layout import Layout
@@ -218,10 +219,12 @@ class Plan:
         edge = np.where(fwhm < half, half - 0.5 * fwhm, np.inf)
         pitch = layout.pitch_px
         neighbours = neighbours_of(layout.cells, layout.geometry, diagonal=True)
+        lanes = lanes_for(np.float32)
         return Expected(
+            lanes,
             np.ascontiguousarray(sensor.zero.T, np.float32),
             np.ascontiguousarray(edge.T, np.float32),
-            *lines_of(neighbours),
+            *lines_of(neighbours, lanes.width),
             continued(neighbours),
             np.float32(np.inf if pitch is None else min(LEAST_DIFFERENCE * pitch, LEAST_DIFFERENCE_PX)),
         )
@@ -254,8 +257,8 @@ class SmallFrames:
         A frame (1, h, w), into which each frame is copied, and its calibration.
     scratch : Scratch
         Memory of the thread.
-    flag_doubtful : function
-        Sets the flags that depend on all slopes, see `SlopePipeline.flag_doubtful`.
+    check : function
+        Returns a function that sets the flags that depend on all slopes; see `SlopePipeline.flag_doubtful`.
     """
 
     def __init__(
@@ -263,7 +266,7 @@ class SmallFrames:
         plan: Plan,
         source: Source,
         scratch: Scratch,
-        flag_doubtful: Callable[[SlopeArrays, NDArray[np.generic]], None],
+        check: Callable[[SlopeArrays, NDArray[np.generic]], Callable[[], None]],
     ) -> None:
         n = len(source.corners)
         groups = -(-n // source.lanes.width)
@@ -273,11 +276,11 @@ class SmallFrames:
         self._kernel = plan.kernel(source.frames)
         task = plan.task(np.zeros(1, np.int64))
         self._arguments = source, task, 0, groups, scratch, self._results, NO_STAGES
-        self._flag_doubtful = flag_doubtful
+        self._check = check(self._results, source.frames)
 
     def __call__(self, frame: NDArray[np.generic]) -> Slopes:
         """Measure a frame (h, w)."""
         np.copyto(self._frame, frame)
         self._kernel(*self._arguments)
-        self._flag_doubtful(self._results, self._frame[None])
+        self._check()
         return Slopes(*[values.copy() for values in self._slopes])

@@ -6,8 +6,9 @@ import copy
 import hashlib
 import math
 import threading
+from collections.abc import Callable
 from dataclasses import fields
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,7 @@ from faintspot.slopes.camera.calibration import Calibration, binned, binned_cali
 from faintspot.slopes.estimators.base import Estimator
 from faintspot.slopes.kernels.compiling import Direct
 from faintspot.slopes.kernels.dark import scratch_size
-from faintspot.slopes.kernels.doubtful import check_slopes
+from faintspot.slopes.kernels.doubtful import check_slopes, doubtful_scratch_size
 from faintspot.slopes.kernels.groups import CALIBRATED, STAGE_ROWS, Scratch, SlopeArrays, Source
 from faintspot.slopes.kernels.host import lanes_for
 from faintspot.slopes.kernels.parallel import most_threads, run_groups, thread_scratch
@@ -127,7 +128,8 @@ class SlopePipeline:
         """Settings and tables computed before the first frame."""
         self.light_test = light_test(self.binned_layout, maps, self.plan.typical_fwhm_px)
         """Test for sub-apertures without flux."""
-        self._scratch_size = scratch_size(len(self.layout), *self.binned_layout.window)
+        sizes = scratch_size(*self.binned_layout.window), doubtful_scratch_size(len(self.layout))
+        self._scratch_size = max(sizes)
         self._checks = {dtype: _checks(dtype, self.light_test.lanes) for dtype in _KERNEL_TYPES}
 
     @property
@@ -314,7 +316,7 @@ class SlopePipeline:
             return None
         frames = np.empty((1, *self.layout.frame_shape), np.float32 if dtype.kind == "f" else np.uint16)
         scratch = thread_scratch(lanes, window, plan.own_scratch)
-        return SmallFrames(plan, self.source(frames, dtype), scratch, self.flag_doubtful)
+        return SmallFrames(plan, self.source(frames, dtype), scratch, self._check)
 
     def explain(self, frame: ArrayLike, prior: ArrayLike | Slopes | None = None) -> Stages:
         """Return the sub-aperture images after every step, for figures and for debugging.
@@ -394,8 +396,13 @@ class SlopePipeline:
             Slopes of the frames; changed.
         frames : (n, h, w) array, uint16 or float32, contiguous
         """
+        self._check(results, frames)()
+
+    def _check(self, results: SlopeArrays, frames: NDArray[Any]) -> Callable[[], None]:
+        """Return `flag_doubtful` for these arrays, to be called for all frames that are written to them."""
         scratch = np.empty(self._scratch_size, np.float32)
-        self._checks[frames.dtype](self.light_test, frames, results, self.plan.expected, scratch)
+        kernel = self._checks[frames.dtype]
+        return partial(kernel, self.light_test, frames, results, self.plan.expected, scratch)
 
     def source(self, frames: NDArray[np.generic], dtype: DTypeLike) -> Source:
         """Return the frames in the form that kernels read.

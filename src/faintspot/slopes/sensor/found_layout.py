@@ -11,7 +11,8 @@ from numpy.typing import ArrayLike, NDArray
 from faintspot.base.checks import number_between
 from faintspot.base.errors import InputError
 from faintspot.base.statistics import MAD_TO_STD
-from faintspot.slopes.kernels.doubtful import Expected, flag_doubtful
+from faintspot.slopes.kernels.doubtful import Expected, doubtful_scratch_size, flag_doubtful
+from faintspot.slopes.kernels.host import lanes_for
 from faintspot.slopes.sensor.binning import magnified_layout, scaled_points
 from faintspot.slopes.sensor.detection.lenslets import LensletGrid
 from faintspot.slopes.sensor.layout import Layout
@@ -120,15 +121,17 @@ def _unlike(grid: LensletGrid) -> NDArray[np.bool_]:
     x, y = np.asarray(grid.spots - grid.centres - grid.drifts, np.float32).T
     n = len(x)
     flags = np.zeros((1, n), np.uint8)
+    lanes = lanes_for(np.float32)
     expected = Expected(
+        lanes,
         np.zeros((2, n), np.float32),
         np.full((2, n), np.inf, np.float32),
-        *lines_of(neighbours_of(grid.cells, grid.geometry, diagonal=True)),
+        *lines_of(neighbours_of(grid.cells, grid.geometry, diagonal=True), lanes.width),
         np.zeros((n, 0, 2), np.int64),
         np.float32(LEAST_DIFFERENCE * grid.pitch_px),
     )
     x, y = np.ascontiguousarray(x[None]), np.ascontiguousarray(y[None])
-    flag_doubtful(x, y, np.zeros_like(x), flags, expected, np.empty(n, np.float32))
+    flag_doubtful(x, y, np.zeros_like(x), flags, expected, np.empty(doubtful_scratch_size(n), np.float32))
     return np.asarray(flags[0] != 0)
 
 

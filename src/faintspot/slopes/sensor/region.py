@@ -101,7 +101,7 @@ def neighbours_of(cells: NDArray[np.int64], geometry: str, *, diagonal: bool = F
     return np.column_stack([index[shifted[:, 0] + row, shifted[:, 1] + column] for row, column in steps])
 
 
-def lines_of(neighbours: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+def lines_of(neighbours: NDArray[np.int64], multiple: int) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
     """Return pairs of cells in line with each cell, from the table that `neighbours_of` returns.
 
     They are opposite neighbours. Cells at the edge of the array, with fewer than two of these pairs, also
@@ -109,10 +109,11 @@ def lines_of(neighbours: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[
 
     Returns
     -------
-    lines : (n, m, 2) array of int
-        n where there is none; those come last.
-    outside : (n, m) array of bool
-        Whether both are on the same side, the nearer one first.
+    lines : (m, 2, p) array of int32
+        n where there is none; those come last. p is n, or as much more as makes it a multiple of `multiple`.
+    far : (m, p) array of float32
+        Weight of the second cell of each pair in the line, 1 less that of the first: 0.5 if they are
+        opposite; -1 if both are on the same side, the nearer one first.
     """
     n, count = neighbours.shape
     opposite = neighbours.reshape(n, count // 2, 2)
@@ -120,12 +121,15 @@ def lines_of(neighbours: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[
     same_side = continued(neighbours)
     same_side[~few] = n
     lines = np.concatenate([opposite, same_side], axis=1)
-    outside = np.broadcast_to(np.arange(lines.shape[1]) >= count // 2, lines.shape[:2])
     complete = (lines < n).all(axis=2)
     lines[~complete] = n
     order = np.argsort(~complete, axis=1, kind="stable")[:, : max(complete.sum(axis=1).max(), 1)]
-    taken = np.take_along_axis(lines, order[:, :, None], axis=1)
-    return np.ascontiguousarray(taken), np.ascontiguousarray(np.take_along_axis(outside, order, axis=1))
+    taken, outside = np.take_along_axis(lines, order[:, :, None], axis=1), order >= count // 2
+    more = -n % multiple
+    table = np.pad(taken.transpose(1, 2, 0), ((0, 0), (0, 0), (0, more)), constant_values=n)
+    weight = np.where(n == taken[:, :, 0].T, np.nan, np.where(outside.T, -1.0, 0.5))
+    far = np.pad(weight, ((0, 0), (0, more)), constant_values=np.nan)
+    return np.ascontiguousarray(table, np.int32), np.ascontiguousarray(far, np.float32)
 
 
 def continued(neighbours: NDArray[np.int64]) -> NDArray[np.int64]:
