@@ -31,3 +31,14 @@ def assert_each_refused(call: Callable[..., Any], **values: Iterable[Any]) -> No
                     call(**{name: value})
             except (AssertionError, pytest.fail.Exception) as error:
                 raise AssertionError(f"{name} = {value!r}: {error}") from error
+
+
+def refused_in_one_line(call: Callable[[], Any]) -> Any:
+    """Return what a call returns, or None where it refuses with an InputError in one line."""
+    try:
+        return call()
+    except InputError as error:
+        message = str(error)
+    if not message or "\n" in message:
+        raise AssertionError(f"expected one line, got {message!r}")
+    return None

@@ -13,13 +13,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tests.simulated import frames_of
 
 import faintspot as fs
 from faintspot.engine.telemetry.recorder import TelemetryStore
 from faintspot.engine.telemetry.ring import image_type, layout_values, record_type
 from faintspot.io import read_telemetry, write_aot
 from faintspot.slopes.estimators import estimators, registry
+from faintspot.slopes.simulate import sensor_frames
 
 ROOT = Path(__file__).resolve().parents[1]
 FOLDERS = ("", "adapters", "guide", "reference", "results")
@@ -67,7 +67,7 @@ def assumed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, A
     layout = fs.Layout.grid((7, 7), pixels=16, outer_radius=3.5, inner_radius=0.5)
     calibration = fs.Calibration(dark=100.0, gain_e_per_adu=2.0, read_noise_e=3.0)
     dithered = 0.2 * np.sin(2 * np.pi * np.arange(1000) * 0.13)[:, None, None]
-    electrons, truth = frames_of(
+    electrons, truth = sensor_frames(
         layout,
         1000,
         flux_e=400.0,

@@ -13,12 +13,12 @@ import click
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from tests.simulated import frames_of
 from tests.test_documentation import PAGES, ROOT
 
 import faintspot as fs
 from faintspot.cli import group
 from faintspot.data import mmt_frame
+from faintspot.slopes.simulate import sensor_frames
 
 BLOCK = re.compile(r"^```(\S*)\n(.*?)^```$", re.DOTALL | re.MULTILINE)
 IN_TEXT = re.compile(r"`(faintspot [a-z][^`|]*)`")
@@ -97,7 +97,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     layout = fs.Layout.grid(
         (14, 14), pixels=16, outer_radius=7, inner_radius=2, origin=(16, 16), frame_shape=(256, 256)
     )
-    electrons, _ = frames_of(layout, 4, flux_e=3000.0, rng=rng)
+    electrons, _ = sensor_frames(layout, 4, flux_e=3000.0, rng=rng)
     frames = (electrons / 1.9 + rng.normal(100.0, 2.0, electrons.shape)).astype(np.uint16)
     for name in ("frames", "night", "reference"):
         fits.writeto(folder / f"{name}.fits", frames)

@@ -21,20 +21,9 @@ def test_names_exist_and_are_documented(name: str) -> None:
         assert item.__name__ == name
 
 
-def test_version_has_three_numbers() -> None:
-    assert faintspot.__version__.count(".") == 2
-
-
 def test_unknown_public_name_is_an_attribute_error() -> None:
     with pytest.raises(AttributeError, match="nothing_like_this"):
         _ = faintspot.nothing_like_this
-
-
-def test_errors_are_the_usual_kinds() -> None:
-    assert issubclass(faintspot.InputError, ValueError)
-    assert issubclass(faintspot.MissingExtraError, ImportError)
-    message = str(faintspot.MissingExtraError("zarr", "io", "reading Zarr stores"))
-    assert message == "reading Zarr stores needs zarr: install it with pip install 'faintspot[io]'"
 
 
 def test_flags_are_different_bits() -> None:

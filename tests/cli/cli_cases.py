@@ -10,13 +10,12 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from tests.simulated import frames_of
 
 import faintspot
 from faintspot import Layout, Settings, SlopePipeline, Slopes
 from faintspot.cli import main
 from faintspot.io import read_slopes
-from faintspot.slopes.simulate import Detector
+from faintspot.slopes.simulate import Detector, sensor_frames
 
 LAYOUT = Layout.grid((4, 4), pixels=8)
 SETTINGS = Settings(noise_std=2.0, keep_brightest=10)
@@ -85,7 +84,9 @@ class Commands:
 def simulated(n_frames: int = 30, seed: int = 1) -> NDArray[np.uint16]:
     """Return frames of LAYOUT: 16 spots of 400 e- at 2 e- of read noise, an offset of 20."""
     detector = Detector(read_noise_e=2.0, offset_adu=20.0, bits=16)
-    frames, _ = frames_of(LAYOUT, n_frames, flux_e=400.0, detector=detector, rng=np.random.default_rng(seed))
+    frames, _ = sensor_frames(
+        LAYOUT, n_frames, flux_e=400.0, detector=detector, rng=np.random.default_rng(seed)
+    )
     return np.asarray(frames, np.uint16)
 
 

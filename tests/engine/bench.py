@@ -8,7 +8,6 @@ from uuid import uuid4
 import numpy as np
 from numpy.typing import NDArray
 from tests.patience import LIMIT_S, wait_for
-from tests.simulated import frames_of
 
 import faintspot as fs
 from faintspot.base.files import Closing
@@ -16,6 +15,7 @@ from faintspot.engine.engine import Engine
 from faintspot.engine.pixel_ring import PixelRing
 from faintspot.engine.plan import EngineOptions
 from faintspot.engine.telemetry.ring import TelemetryRing
+from faintspot.slopes.simulate import sensor_frames
 
 LAYOUT = fs.Layout.grid((4, 4), pixels=8)
 CALIBRATION = fs.Calibration(100.0, read_noise_e=1.0)
@@ -28,7 +28,7 @@ def make(settings: fs.Settings) -> fs.SlopePipeline:
 
 def simulated(n: int) -> NDArray[np.uint16]:
     detector = fs.slopes.simulate.Detector(1.0, offset_adu=100.0, bits=16)
-    frames, _ = frames_of(LAYOUT, n, flux_e=300.0, detector=detector, rng=np.random.default_rng(8))
+    frames, _ = sensor_frames(LAYOUT, n, flux_e=300.0, detector=detector, rng=np.random.default_rng(8))
     return np.asarray(frames, np.uint16)
 
 

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from tests.simulated import frames_of
 
 import faintspot as fs
 from faintspot.engine.frame_path import FramePath, Progress, last_rows_of_groups
@@ -30,6 +29,7 @@ from faintspot.slopes.kernels.streaming import (
     sleep_until_due,
     wait_for_group,
 )
+from faintspot.slopes.simulate import sensor_frames
 
 pytestmark = pytest.mark.slow
 
@@ -47,7 +47,7 @@ SETTINGS = {
 
 def frames(n: int, dtype: Any = np.uint16) -> NDArray[Any]:
     detector = fs.slopes.simulate.Detector(1.0, offset_adu=100.0, bits=16)
-    simulated, _ = frames_of(LAYOUT, n, flux_e=200.0, detector=detector, rng=np.random.default_rng(4))
+    simulated, _ = sensor_frames(LAYOUT, n, flux_e=200.0, detector=detector, rng=np.random.default_rng(4))
     return np.asarray(simulated).astype(dtype)
 
 

@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 from PIL import Image
-from tests.fuzz.refused import refused_in_one_line
 from tests.io import loop_layouts
+from tests.refusals import refused_in_one_line
 
 import faintspot as fs
 from faintspot.experiments.study.specification import StudySpecification

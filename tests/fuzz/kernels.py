@@ -25,7 +25,7 @@ from tests.estimator_cases import (
 )
 from tests.estimator_oracle import assert_equals_oracle
 from tests.fuzz.guarded import guarded, guarded_tree
-from tests.fuzz.refused import refused_in_one_line
+from tests.refusals import refused_in_one_line
 
 import faintspot as fs
 from faintspot.base.tables import PRESETS

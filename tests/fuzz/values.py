@@ -15,7 +15,7 @@ from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays_of
 from tests.engine.test_control_loop import any_control
-from tests.fuzz.refused import refused_in_one_line
+from tests.refusals import refused_in_one_line
 from tests.slopes.estimators.test_python import BRIGHT, FAULTS, FRAME, pipeline, raising
 
 import faintspot as fs

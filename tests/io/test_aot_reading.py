@@ -14,13 +14,13 @@ from numpy.typing import NDArray
 from tests.cli.cli_cases import Commands
 from tests.io.telemetry_files import ATTRIBUTES, IMAGE, RECORD, N, images_of, records_of
 from tests.refusals import refused
-from tests.simulated import frames_of
 
 import faintspot as fs
 from faintspot.engine.telemetry.recorder import TelemetryStore
 from faintspot.io import open_frames, read_aot, read_slopes, read_telemetry, write_aot
 from faintspot.slopes.pipeline import configuration
 from faintspot.slopes.recorded.measuring import measure_recorded
+from faintspot.slopes.simulate import sensor_frames
 
 aotpy: Any = pytest.importorskip("aotpy")
 pytestmark = pytest.mark.filterwarnings("ignore:.AOT_")
@@ -110,43 +110,26 @@ def test_values_of_a_loop(tmp_path: Path) -> None:
 
 
 def test_ours_is_measured_as_it_was(tmp_path: Path, run: Commands, monkeypatch: pytest.MonkeyPatch) -> None:
-    rng = np.random.default_rng(2)
+    """With an estimator that needs the read noise and the spot; settings of a faintspot.toml come first."""
     images = images_of(10, 20)
-    frames, _ = frames_of(LAYOUT, 2, flux_e=300.0, rng=rng)
-    images["raw"] = frames
-    settings = fs.Settings("tv", noise_std=1.5, keep_brightest=9)
-    path = own(tmp_path, images, settings=configuration.to_text(settings), reference=REFERENCE.tolist())
+    images["raw"], _ = sensor_frames(LAYOUT, 2, flux_e=300.0, rng=np.random.default_rng(2))
+    dark = np.random.default_rng(3).normal(0, 0.1, LAYOUT.frame_shape)
+    parts = fs.Calibration(dark, read_noise_e=1.5), fs.PSF.analytic(size=1.2, radius_px=5)
+    settings, packed = fs.Settings("ml"), configuration.packed(*parts, None)
+    reference = REFERENCE.tolist()
+    own(tmp_path, images, settings=configuration.to_text(settings), parts=packed, reference=reference)
     monkeypatch.chdir(tmp_path)
     out = run.ok("slopes", "night.fits", "-o", "slopes.npz").out
     assert "sub-apertures, reference slopes, settings of night.fits" in out
-    expected = fs.SlopePipeline(LAYOUT, settings, reference=REFERENCE)(images["raw"])
-    stored = read_slopes(tmp_path / "slopes.npz")
+    pipeline = fs.SlopePipeline(LAYOUT, settings, parts[0], psf=parts[1], reference=REFERENCE)
+    expected, stored = pipeline(images["raw"]), read_slopes(tmp_path / "slopes.npz")
     assert np.array_equal(stored.variables["x"], expected.x)
     assert np.array_equal(stored.variables["y"], expected.y)
     fs.Settings("centroid").save(tmp_path / "faintspot.toml")
-    out = run.ok("slopes", path, "-o", "centroids.npz").out
-    assert f"sub-apertures, reference slopes of {path}" in out
+    out = run.ok("slopes", "night.fits", "-o", "centroids.npz").out
+    assert "sub-apertures, reference slopes of night.fits" in out
     centroids = fs.SlopePipeline(LAYOUT, fs.Settings("centroid"), reference=REFERENCE)(images["raw"])
     assert np.array_equal(read_slopes(tmp_path / "centroids.npz").variables["x"], centroids.x)
-
-
-def test_ours_with_calibration_and_psf(
-    tmp_path: Path, run: Commands, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """An estimator that needs the read noise and the spot: slopes are those of the recording, bit for bit."""
-    images = images_of(10, 20)
-    images["raw"], _ = frames_of(LAYOUT, 2, flux_e=300.0, rng=np.random.default_rng(2))
-    settings = fs.Settings("ml")
-    dark = np.random.default_rng(3).normal(0, 0.1, LAYOUT.frame_shape)
-    parts = fs.Calibration(dark, read_noise_e=1.5), fs.PSF.analytic(size=1.2, radius_px=5)
-    packed = configuration.packed(*parts, None)
-    own(tmp_path, images, settings=configuration.to_text(settings), parts=packed)
-    monkeypatch.chdir(tmp_path)
-    run.ok("slopes", "night.fits", "-o", "slopes.npz")
-    expected = fs.SlopePipeline(LAYOUT, settings, parts[0], psf=parts[1])(images["raw"])
-    stored = read_slopes(tmp_path / "slopes.npz")
-    assert np.array_equal(stored.variables["x"], expected.x)
-    assert np.array_equal(stored.variables["y"], expected.y)
     large = fs.Calibration(np.random.default_rng(3).normal(size=(400, 400)))
     assert configuration.packed(large, None, None) is None
 

@@ -97,23 +97,6 @@ class AotSensor:
         return getattr(self, name) is not None
 
 
-def frames_of_aot(path: Path, sensor: str | None) -> str:
-    """Return the name of the image that holds a sensor's frames; see `read_aot`.
-
-    Raises
-    ------
-    InputError
-        When the sensor has no pixels, and as `read_aot`.
-    """
-    aot_sensor = read_aot(path, sensor)
-    if aot_sensor.pixels is None:
-        raise InputError(
-            f"{path}: sensor {aot_sensor.name!r}: expected frames (pixel_intensities of its detector), "
-            "found none"
-        )
-    return aot_sensor.pixels
-
-
 def read_aot(path: str | Path, sensor: str | None = None) -> AotSensor:
     """Read a Shack-Hartmann sensor from an AOT file.
 

@@ -4,7 +4,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from tests.experiments.planner_cases import answered
-from tests.simulated import frames_of
 
 from faintspot import Calibration, InputError, Layout, SlopePipeline
 from faintspot.base.statistics import slope_error
@@ -12,7 +11,7 @@ from faintspot.experiments.planner import text as answer_text
 from faintspot.experiments.planner.answer import Answer
 from faintspot.experiments.planner.text import tune_figure
 from faintspot.slopes.estimators import estimators
-from faintspot.slopes.simulate import Detector
+from faintspot.slopes.simulate import Detector, sensor_frames
 
 LAYOUT = Layout.grid((4, 4), pixels=12)
 
@@ -28,7 +27,7 @@ def test_the_configuration_gives_the_error_that_was_promised(name: str, tmp_path
     answer.save(tmp_path / "faintspot.toml")
     pipeline = SlopePipeline.from_file(tmp_path / "faintspot.toml")
     camera = Detector(read_noise_e=3.0)
-    frames, truth = frames_of(LAYOUT, 64, flux_e=200.0, detector=camera, rng=np.random.default_rng(8))
+    frames, truth = sensor_frames(LAYOUT, 64, flux_e=200.0, detector=camera, rng=np.random.default_rng(8))
     slopes = pipeline(frames)
     found = slope_error(slopes.x, slopes.y, truth)
     # Two samples of 512 and 1024 spots: 3 % and 2 %.

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import pytest
 from tests.experiments.planner_cases import QUICK
-from tests.simulated import frames_of
 
 from faintspot.base.statistics import Estimate
 from faintspot.experiments import Answer, Promise, Question, question_from_frames, tune
@@ -23,7 +22,7 @@ from faintspot.experiments.planner.promise import (
 from faintspot.experiments.planner.text import CONTRADICTED, promise_lines
 from faintspot.slopes.pipeline.slope_pipeline import SlopePipeline
 from faintspot.slopes.sensor.layout import Layout
-from faintspot.slopes.simulate import Detector
+from faintspot.slopes.simulate import Detector, sensor_frames
 from faintspot.slopes.spots.psf import PSF
 from faintspot.slopes.training.psf_learning import LearntPSF
 
@@ -35,7 +34,7 @@ def answered(movement_px: float, gain: float, **given: float) -> Answer:
     rng = np.random.default_rng(5)
     camera = Detector(read_noise_e=3.0, gain_e_per_adu=gain, offset_adu=100.0, background_e=3.0)
     positions = rng.uniform(-0.5, 0.5, (36, 2)) + movement_px * rng.standard_normal((40, 36, 2))
-    frames, _ = frames_of(LAYOUT, 40, flux_e=300.0, positions=positions, detector=camera, rng=rng)
+    frames, _ = sensor_frames(LAYOUT, 40, flux_e=300.0, positions=positions, detector=camera, rng=rng)
     return tune(question_from_frames(frames, layout=LAYOUT, **given), **QUICK)
 
 
@@ -116,7 +115,7 @@ def test_spots_in_the_middle_of_the_search_range_have_larger_errors_than_spread_
     """The range of 1 px cuts errors of spots near its edges: 0.25 px against 0.28 px at 0.36 px rms."""
     rng = np.random.default_rng(7)
     camera = Detector(read_noise_e=3.0, offset_adu=100.0)
-    frames, truth = frames_of(LAYOUT, 80, flux_e=36.0, position_range_px=0.01, detector=camera, rng=rng)
+    frames, truth = sensor_frames(LAYOUT, 80, flux_e=36.0, position_range_px=0.01, detector=camera, rng=rng)
     known: dict[str, Any] = {
         "gain_e_per_adu": 1.0,
         "read_noise_e": 3.0,

@@ -5,7 +5,6 @@ import pytest
 from tests.experiments.planner_cases import QUICK
 from tests.refusals import refused
 from tests.shared_data import shared_file
-from tests.simulated import frames_of
 
 from faintspot.base.errors import InputError
 from faintspot.experiments import question_from_frames, tune
@@ -13,7 +12,7 @@ from faintspot.experiments.planner.promise import frames_to_check
 from faintspot.experiments.planner.text import UNCHECKED, recommendation
 from faintspot.io.frames import read_array
 from faintspot.slopes.sensor.layout import Layout
-from faintspot.slopes.simulate import Detector
+from faintspot.slopes.simulate import Detector, sensor_frames
 
 LAYOUT, WIDE = Layout.grid((6, 6), pixels=12), Layout.grid((6, 6), pixels=20)
 CAMERA = Detector(read_noise_e=4.0, gain_e_per_adu=0.5, offset_adu=100.0)
@@ -23,7 +22,7 @@ def recorded(n_frames: int = 30) -> tuple[np.ndarray, np.ndarray]:
     """Return frames of a static field and darks."""
     rng = np.random.default_rng(4)
     positions = rng.uniform(-0.6, 0.6, (len(LAYOUT), 2))
-    frames, _ = frames_of(LAYOUT, n_frames, flux_e=3000.0, positions=positions, detector=CAMERA, rng=rng)
+    frames, _ = sensor_frames(LAYOUT, n_frames, flux_e=3000.0, positions=positions, detector=CAMERA, rng=rng)
     return frames, CAMERA.expose(np.zeros((20, *LAYOUT.frame_shape)), rng)
 
 
@@ -96,7 +95,7 @@ def test_a_faint_recording_has_the_range_of_its_spots() -> None:
     rng = np.random.default_rng(3)
     layout, camera = Layout.grid((6, 6), pixels=16), Detector(read_noise_e=3.0, offset_adu=100.0)
     positions = rng.uniform(-0.5, 0.5, (len(layout), 2))
-    frames, _ = frames_of(layout, 30, flux_e=30.0, positions=positions, detector=camera, rng=rng)
+    frames, _ = sensor_frames(layout, 30, flux_e=30.0, positions=positions, detector=camera, rng=rng)
     known: dict[str, Any] = {"layout": layout, "gain_e_per_adu": 1.0, "read_noise_e": 3.0, "fwhm_px": 1.77}
     question = question_from_frames(frames, **known)
     assert question.spots.search_range_px == 1.0  # 7.9 where noise is taken for spots
@@ -133,7 +132,7 @@ def test_flux_that_differs_between_subapertures_is_simulated_so() -> None:
     rng = np.random.default_rng(6)
     flux = np.where(np.arange(36) % 2, 500.0, 1500.0)
     positions = rng.uniform(-0.6, 0.6, (12, 36, 2))
-    frames, _ = frames_of(LAYOUT, 12, flux_e=flux, positions=positions, detector=CAMERA, rng=rng)
+    frames, _ = sensor_frames(LAYOUT, 12, flux_e=flux, positions=positions, detector=CAMERA, rng=rng)
     question = question_from_frames(frames, layout=LAYOUT, gain_e_per_adu=0.5)
     assert question.star_flux_e == pytest.approx(1000.0, rel=0.03)
     assert question.spots.relative_flux is not None
@@ -153,7 +152,7 @@ def test_unreliable_gain_is_not_used() -> None:
 
 def test_dark_subapertures_are_left_out_of_the_question_but_not_of_the_layout() -> None:
     lit = np.arange(36) != 7
-    frames, _ = frames_of(LAYOUT, 12, flux_e=1000.0 * lit, detector=CAMERA, rng=np.random.default_rng(7))
+    frames, _ = sensor_frames(LAYOUT, 12, flux_e=1000.0 * lit, detector=CAMERA, rng=np.random.default_rng(7))
     question = question_from_frames(frames, layout=LAYOUT, gain_e_per_adu=0.5)
     assert "left out 1 of 36 sub-apertures: dark" in question.facts
     assert question.star_flux_e == pytest.approx(1000.0, rel=0.03)

@@ -3,7 +3,6 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from tests.simulated import frames_of
 
 import faintspot as fs
 from faintspot.slopes.camera.frame_checks import (
@@ -13,13 +12,13 @@ from faintspot.slopes.camera.frame_checks import (
     misread,
     mosaic_contrast,
 )
-from faintspot.slopes.simulate import Detector
+from faintspot.slopes.simulate import Detector, sensor_frames
 
 
 def test_hot_pixels_among_spots_are_found_and_spots_are_not() -> None:
     layout = fs.Layout.grid((6, 6), pixels=16)
     hot = [(5, 5, 200.0), (34, 46, 400.0), (95, 0, 150.0), (60, 23, 300.0)]
-    frames, _ = frames_of(
+    frames, _ = sensor_frames(
         layout,
         1,
         flux_e=3000.0,

@@ -7,11 +7,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from tests.refusals import assert_each_refused
-from tests.simulated import frames_of
 
 from faintspot.slopes.camera.photon_transfer import measure_detector
 from faintspot.slopes.sensor.layout import Layout
-from faintspot.slopes.simulate import Detector
+from faintspot.slopes.simulate import Detector, sensor_frames
 
 CAMERA = Detector(5.0, gain_e_per_adu=2.0, offset_adu=100.0, bits=14)
 MULTIPLYING = Detector(40.0, em_gain=100.0, gain_e_per_adu=20.0, offset_adu=200.0)
@@ -25,7 +24,9 @@ def recorded(
     rng = np.random.default_rng(seed)
     still = rng.uniform(-1, 1, (len(LAYOUT), 2))
     positions = still + movement_px * rng.standard_normal((n_frames, len(LAYOUT), 2))
-    frames, _ = frames_of(LAYOUT, n_frames, flux_e=flux_e, positions=positions, detector=detector, rng=rng)
+    frames, _ = sensor_frames(
+        LAYOUT, n_frames, flux_e=flux_e, positions=positions, detector=detector, rng=rng
+    )
     return frames, detector.expose(np.zeros((30, *LAYOUT.frame_shape)), rng)
 
 

@@ -4,7 +4,6 @@ from typing import Any
 import numpy as np
 import pytest
 from tests.refusals import assert_each_refused, refused
-from tests.simulated import frames_of
 from tests.slopes.estimators.image_cases import BAD_IMAGES
 
 from faintspot.base.statistics import slope_error
@@ -12,7 +11,7 @@ from faintspot.slopes.estimators.noise import pixel_noise, suggested_strength
 from faintspot.slopes.pipeline.settings import Settings
 from faintspot.slopes.pipeline.slope_pipeline import SlopePipeline
 from faintspot.slopes.sensor.layout import Layout
-from faintspot.slopes.simulate import Detector, subapertures
+from faintspot.slopes.simulate import Detector, sensor_frames, subapertures
 
 
 def test_strength_is_read_noise_and_a_quarter_of_the_photon_noise() -> None:
@@ -84,7 +83,7 @@ def test_suggested_strength_gains_and_the_full_noise_gains_less() -> None:
     """
     layout = Layout.grid((6, 6), pixels=16)
     rng = np.random.default_rng(3)
-    frames, truth = frames_of(layout, 100, flux_e=50.0, detector=Detector(0.1), rng=rng)
+    frames, truth = sensor_frames(layout, 100, flux_e=50.0, detector=Detector(0.1), rng=rng)
 
     def error(settings: Settings) -> tuple[float, float]:
         slopes = SlopePipeline(layout, settings)(frames)

@@ -9,9 +9,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from tests import naive
 from tests.pipeline_cases import FIELDS, assert_same
-from tests.simulated import frames_of
 
 import faintspot as fs
+from faintspot.slopes.simulate import sensor_frames
 
 Flag = fs.SubapertureFlag
 
@@ -155,7 +155,7 @@ class TestWindows:
     def test_windows_of_any_size_and_number_equal_the_oracle(self, window: tuple[int, int], n: int) -> None:
         layout = fs.Layout.grid((1, n), pixels=window)
         rng = np.random.default_rng(7)
-        frames, truth = frames_of(layout, 4, flux_e=5000.0, rng=rng)
+        frames, truth = sensor_frames(layout, 4, flux_e=5000.0, rng=rng)
         settings = fs.Settings(noise_std=0.3, max_iterations=40)
         slopes = fs.SlopePipeline(layout, settings)(frames)
         assert slopes.valid.all()

@@ -7,18 +7,18 @@ from typing import Any
 import numpy as np
 import pytest
 from tests.refusals import refused
-from tests.simulated import frames_of
 
 import faintspot as fs
 from faintspot.slopes.estimators import spot_tables
 from faintspot.slopes.pipeline import configuration
+from faintspot.slopes.simulate import sensor_frames
 
 LAYOUT = fs.Layout.grid((3, 4), pixels=12)
 NOISE = fs.Calibration(dark=0.0, read_noise_e=1.0)
 
 
 def frames(n: int, flux_e: float, seed: int = 1) -> tuple[Any, Any]:
-    return frames_of(
+    return sensor_frames(
         LAYOUT, n, flux_e=flux_e, detector=fs.slopes.simulate.Detector(1.0), rng=np.random.default_rng(seed)
     )
 

@@ -6,11 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from tests.simulated import frames_of
 
 import faintspot as fs
 from faintspot import Calibration, InputError, Layout, MissingExtraError, Settings, SlopePipeline, Slopes
 from faintspot.slopes.kernels.groups import SlopeArrays
+from faintspot.slopes.simulate import sensor_frames
 
 LAYOUT = fs.Layout.grid((7, 7), pixels=8, outer_radius=3.5, inner_radius=0.5)
 
@@ -33,7 +33,7 @@ SCALED_LAYOUT = Layout.grid((2, 3), pixels=8, pixel_scale_arcsec=0.5)
 
 @pytest.fixture(scope="module")
 def slopes() -> Slopes:
-    frames, _ = frames_of(SCALED_LAYOUT, 4, rng=np.random.default_rng(1))
+    frames, _ = sensor_frames(SCALED_LAYOUT, 4, rng=np.random.default_rng(1))
     settings, noise = Settings(estimator="brightest", keep_brightest=8), Calibration(read_noise_e=1.0)
     return SlopePipeline(SCALED_LAYOUT, settings, noise)(frames)
 

@@ -7,12 +7,12 @@ from typing import Any
 import numpy as np
 import pytest
 from tests.cli.cli_cases import Commands
-from tests.simulated import frames_of
 
 import faintspot as fs
 from faintspot.base.errors import InputError
 from faintspot.io import open_frames
 from faintspot.slopes.recorded.sodium import sodium_of_frames
+from faintspot.slopes.simulate import sensor_frames
 from faintspot.slopes.spots.laser_spots import LaserSpots
 
 LAYOUT = fs.Layout.grid((6, 6), pixels=10, pixel_scale_arcsec=0.5, subaperture_m=1.3)
@@ -32,7 +32,7 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
         "jitter_px": 0.2,
     }
     detector = fs.slopes.simulate.Detector(1.0, offset_adu=DARK_ADU)
-    frames, _ = frames_of(LAYOUT, FRAMES, **star, detector=detector, rng=np.random.default_rng(1))
+    frames, _ = sensor_frames(LAYOUT, FRAMES, **star, detector=detector, rng=np.random.default_rng(1))
     frames[:, 14, 25] = 1e4
     folder = tmp_path_factory.mktemp("sodium")
     np.save(folder / "frames.npy", frames)

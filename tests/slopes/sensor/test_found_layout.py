@@ -6,13 +6,12 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from tests.simulated import frames_of
 from tests.slopes.sensor.sensor_cases import spot_frame
 
 import faintspot as fs
 from faintspot import Layout
 from faintspot.slopes.sensor.found_layout import find_illuminated, find_layout
-from faintspot.slopes.simulate import Detector
+from faintspot.slopes.simulate import Detector, sensor_frames
 
 RATIOS = {"square": 1j, "hexagonal": np.exp(1j * np.pi / 3)}
 
@@ -166,7 +165,7 @@ PUPIL = Layout.grid((10, 12), pixels=2, outer_radius=5.2, inner_radius=1.2)
 
 
 def frame(layout: Layout = PUPIL, flux_e: float = 200.0, n: int = 30, offset: float = 0.0) -> NDArray[Any]:
-    frames, _ = frames_of(
+    frames, _ = sensor_frames(
         layout,
         n,
         flux_e=flux_e,

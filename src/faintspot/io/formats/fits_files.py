@@ -48,13 +48,19 @@ class Fits(FileFormat):
         the frames of the sensor `key`, by default of the only one.
         """
         if fits_units.AOT_VERSION in next(fits_units.units_of(path)).header:
-            from faintspot.io.aot_reading import frames_of_aot
+            from faintspot.io.aot_reading import read_aot
 
             names = {
                 name for unit in fits_units.units_of(path) for name in (unit.name.upper(), str(unit.index))
             }
             if key is None or key.strip().upper() not in names:
-                key = frames_of_aot(path, key)
+                sensor = read_aot(path, key)
+                if sensor.pixels is None:
+                    raise InputError(
+                        f"{path}: sensor {sensor.name!r}: expected frames (pixel_intensities of its "
+                        "detector), found none"
+                    )
+                key = sensor.pixels
         name = f"{path}:{key}" if key is not None else str(path)
         unit, column = _find_unit(path, key)
         return _image(name, path, unit) if column is None else _column(name, path, unit, column)

@@ -166,35 +166,6 @@ def describe_store(path: Path) -> ExistingOutput | None:
     return ExistingOutput(attributes["fingerprint"], sizes, attributes[_COMPLETE])
 
 
-def read_store(path: Path) -> StoredSlopes:
-    """Read the finished frames of a Zarr store of slopes.
-
-    Raises
-    ------
-    InputError
-        When it is not a store of slopes, or a chunk is damaged or missing.
-    """
-    if not is_store(path):
-        raise InputError(f"{path}: expected a Zarr store of slopes, got another directory")
-    attributes = _stored_attributes(path)
-    finished, complete = int(attributes.pop(_MARK)), bool(attributes.pop(_COMPLETE))
-    coordinates = attributes.pop(_COORDINATES, "").split()
-    for size in ("n_frames", "n_subapertures"):
-        del attributes[size]
-    group: Any = open_store(path)
-    stored = [name for name in (*VARIABLES, *coordinates) if name in group]
-    check_stated(path, {name: group[name].shape for name in stored}, finished)
-    return StoredSlopes(
-        variables=with_absent(
-            {name: read_items(path, group[name], 0, finished) for name in VARIABLES if name in group}
-        ),
-        coordinates={name: read_items(path, group[name], 0, group[name].shape[0]) for name in coordinates},
-        attributes=attributes,
-        complete=complete,
-        n_finished=finished,
-    )
-
-
 def _create(path: Path, run: RecordingHeader) -> None:
     attributes = {
         **run.attributes,
@@ -276,8 +247,28 @@ class Zarr(FileFormat):
         load_package("zarr")
 
     def read(self, path: Path) -> StoredSlopes:
-        """Read the finished frames of a store."""
-        return read_store(path)
+        """Read the finished frames of a store; refuse damaged or missing chunks."""
+        if not is_store(path):
+            raise InputError(f"{path}: expected a Zarr store of slopes, got another directory")
+        attributes = _stored_attributes(path)
+        finished, complete = int(attributes.pop(_MARK)), bool(attributes.pop(_COMPLETE))
+        coordinates = attributes.pop(_COORDINATES, "").split()
+        for size in ("n_frames", "n_subapertures"):
+            del attributes[size]
+        group: Any = open_store(path)
+        stored = [name for name in (*VARIABLES, *coordinates) if name in group]
+        check_stated(path, {name: group[name].shape for name in stored}, finished)
+        return StoredSlopes(
+            variables=with_absent(
+                {name: read_items(path, group[name], 0, finished) for name in VARIABLES if name in group}
+            ),
+            coordinates={
+                name: read_items(path, group[name], 0, group[name].shape[0]) for name in coordinates
+            },
+            attributes=attributes,
+            complete=complete,
+            n_finished=finished,
+        )
 
     def has_slopes(self, path: Path) -> bool:
         """Return whether the store's attributes are those of slopes."""

@@ -123,21 +123,15 @@ def page_of_loop(report: LoopReport, pieces: Sequence[Piece] = ()) -> Report:
     }
     for name, part in report.parts.items():
         sections.append(_TEXT.section(name, _table(part), more.get(name), missing=part.missing))
+    without_cells = loop.cells is None
+    size = {"Slopes": loop.slopes.shape[1]} if without_cells else {"Sub-apertures": len(loop.cells)}
     return Report(
         f"{'Loop' if loop.is_closed else 'Turbulence'} of {loop.name}",
-        {**_size_of(loop), "Frame rate": f"{loop.frame_rate_hz:.6g} Hz"},
+        {**{name: f"{n}" for name, n in size.items()}, "Frame rate": f"{loop.frame_rate_hz:.6g} Hz"},
         sections,
         [report.advice] if report.advice else [],
         warnings_title="What to do",
         remark=_TEXT["remark"],
-    )
-
-
-def _size_of(loop: Recording) -> dict[str, str]:
-    return (
-        {"Slopes": f"{loop.slopes.shape[1]}"}
-        if loop.cells is None
-        else {"Sub-apertures": f"{len(loop.cells)}"}
     )
 
 
