@@ -167,8 +167,6 @@ def describe(summary: Summary, output: str) -> list[str]:
     lines += [f"  {note}" for note in summary.notes]
     if not any(summary.flag_counts.values()) and not summary.doubtful:
         lines.append("  every slope is valid, without any flag")
-    if summary.failed_frames:
-        lines.append(f"  {summary.failed_frames} frames without slopes: {summary.failure}")
     if summary.bad_frames:
         lines.append(f"  {summary.bad_frames} frames without any valid slope")
     return lines + _next_step(output)

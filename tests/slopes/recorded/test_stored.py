@@ -144,12 +144,6 @@ def test_calibration_maps_come_from_the_original_configuration(tmp_path: Path) -
     assert "settings or calibration of s.npz are not known" in text
 
 
-def test_frames_that_are_not_the_runs_are_noticed(tmp_path: Path) -> None:
-    path = store(tmp_path / "s.npz", sensor())
-    np.save(tmp_path / "frames.npy", simulated(sensor(), 5)[0][::-1] + np.eye(24, dtype=np.float32) * 50)
-    assert "positions that differ from those stored" in Page(report_of_stored([path])).text
-
-
 def measured(folder: Path, name: str, **options: Any) -> Path:
     """Measure frames with an estimator as `faintspot slopes` does; the PSF lies beside the settings."""
     layout = sensor()
@@ -231,5 +225,5 @@ def test_slopes_that_are_left_out_are_counted(tmp_path: Path) -> None:
     assert "Left out 1 of 9 sub-apertures, 1 slope of others: dark, limited." in page.text
     kept = store(tmp_path / "b.npz", sensor(), errors={**errors, "flags": flags}, keep=["limited"])
     page = Page(report_of_stored([first, kept]))
-    assert "a.npz: left out 1 of 9 sub-apertures, 1 slope of others: dark, limited." in page.text
-    assert "b.npz: left out 1 of 9 sub-apertures: dark." in page.text
+    assert "a.npz: Left out 1 of 9 sub-apertures, 1 slope of others: dark, limited." in page.text
+    assert "b.npz: Left out 1 of 9 sub-apertures: dark." in page.text

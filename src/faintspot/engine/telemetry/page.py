@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.errors import InputError
-from faintspot.base.flags import leave_out
 from faintspot.base.report.page import POSITIONS, FigureWithData, Report, Section, configuration_section
 from faintspot.base.report.plots import GREY, METHOD_COLOURS, Line, Panel
 from faintspot.base.report.texts import Texts
@@ -98,13 +97,11 @@ def _facts(telemetry: Telemetry, path: Path) -> dict[str, str]:
 
 def _warnings(telemetry: Telemetry) -> list[str]:
     lost = sum(gap.lost for gap in gaps(telemetry))
-    _, left_out = leave_out(telemetry.flags)
     return _TEXT.lines(
         "telemetry.warnings",
         lost=lost or None,
         share=100 * lost / (lost + len(telemetry.frame)),
         lost_changes=bool(telemetry.attributes.get("dropped_changes")),
-        left_out=left_out.capitalize() or None,
     )
 
 

@@ -55,7 +55,7 @@ class Summary:
     n_frames: int
     n_subapertures: int
     notes: list[str] = field(default_factory=list)
-    """What no configuration states, a line each: of frames, calibration and reference."""
+    """Lines on what no configuration states: of frames, calibration, reference, and a failing estimator."""
     doubtful: bool = False
     """Whether the layout has doubts that nobody has settled."""
     resumed_at: int = 0
@@ -63,10 +63,6 @@ class Summary:
     """Number of slopes of this call with each flag."""
     bad_frames: int = 0
     """Frames of this call without a single valid slope."""
-    failed_frames: int = 0
-    """Frames of this call in which an estimator in NumPy failed."""
-    failure: str = ""
-    """Error of the last of them."""
     repeated_frames: int = 0
     """Frames of this call that are the same as the one before."""
 
@@ -222,7 +218,8 @@ def measure_recorded(
                 last = block[-1]
                 if progress is not None:
                     progress(start + len(block), source.n_frames)
-    summary.failed_frames, summary.failure = prepared.faults - faults, prepared.fault
+    if failed := prepared.faults - faults:
+        summary.notes.append(f"{failed} frames without slopes: {prepared.fault}")
     return summary
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.errors import InputError
-from faintspot.base.flags import SubapertureFlag
+from faintspot.base.flags import SubapertureFlag, leave_out
 from faintspot.base.report.page import POSITIONS, Part, Report, Section, Table, configuration_section
 from faintspot.base.report.texts import Texts, percentage
 from faintspot.base.statistics import UNKNOWN, Estimate
@@ -169,6 +169,8 @@ def warnings_in_words(run: SlopesRun) -> list[str]:
 
 def _of_method(method: MeasuredSlopes) -> list[str]:
     lines = [] if method.valid.any() else [_TEXT["warnings.none_valid"]]
+    _, left_out = leave_out(method.slopes.flags, method.slopes.keep)
+    lines += [f"{left_out.capitalize()}."] if left_out else []
     for flag, (most, advice) in _TEXT["advice"].items():
         fraction = method.flag_count(SubapertureFlag[flag]) / method.valid.size
         if fraction > most:

@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 
 from faintspot.base.checks import not_none
 from faintspot.base.errors import InputError
-from faintspot.base.flags import leave_out
 from faintspot.base.report.page import Report
 from faintspot.base.report.texts import Texts
 from faintspot.io import open_frames
@@ -64,7 +63,7 @@ def report_of_stored(paths: Sequence[str | Path], *, frames: Sequence[str | Path
         title=f"Slopes of {' and '.join(store.path.name for store in stores)}",
         facts=_facts(stores, methods),
         configurations=_configurations(stores, methods),
-        warnings=list(dict.fromkeys([*_labelled_notes(stores, methods), *notes])),
+        warnings=list(dict.fromkeys(notes)),
     )
 
 
@@ -75,17 +74,6 @@ def _configurations(stores: Sequence[StoredRun], methods: Sequence[MeasuredSlope
     return {
         f"Configuration of {method.name}": store.text for store, method in zip(stores, methods, strict=True)
     }
-
-
-def _labelled_notes(stores: Sequence[StoredRun], methods: Sequence[MeasuredSlopes]) -> list[str]:
-    """Return the notes of all runs, with the name of their method where there are several."""
-    notes = []
-    for store, method in zip(stores, methods, strict=True):
-        label = f"{method.name}: " if len(methods) > 1 else ""
-        _, left_out = leave_out(method.slopes.flags, method.slopes.keep)
-        notes += [label + note for note in store.notes]
-        notes += [f"{label}{left_out}." if label else f"{left_out.capitalize()}."] if left_out else []
-    return notes
 
 
 def _check_same_sensor(first: StoredRun, second: StoredRun) -> None:
@@ -105,7 +93,10 @@ def _check_same_sensor(first: StoredRun, second: StoredRun) -> None:
 
 def _methods(stores: Sequence[StoredRun]) -> tuple[list[MeasuredSlopes], list[str]]:
     """Return the slopes of the frames that all files have, and notes about it."""
-    notes = []
+    names, notes = _names(stores), list[str]()
+    for name, store in zip(names, stores, strict=True):
+        label = f"{name}: " if len(names) > 1 else ""
+        notes += [label + note for note in store.notes]
     counts = [store.stored.n_finished for store in stores]
     if len(set(counts)) > 1:
         lengths = {"first": counts[0], "second": counts[1], "fewest": min(counts)}
@@ -114,7 +105,7 @@ def _methods(stores: Sequence[StoredRun]) -> tuple[list[MeasuredSlopes], list[st
     if len(sources) == 2 and sources[0] != sources[1]:
         notes.append(_TEXT["stored.other_sources"])
     methods = []
-    for name, store in zip(_names(stores), stores, strict=True):
+    for name, store in zip(names, stores, strict=True):
         slopes = Slopes.from_variables(store.stored.variables, min(counts), store.keep)
         methods.append(MeasuredSlopes(name, slopes))
     return methods, notes

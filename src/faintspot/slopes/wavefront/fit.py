@@ -68,9 +68,7 @@ class Wavefront:
 
     @property
     def errors_from(self) -> str:
-        """Source of the standard errors: those of the slopes ("slopes"), or the slopes' scatter about the
-        fit ("residuals"), which counts as noise what is not fitted.
-        """
+        """Source of the standard errors: "slopes", or "residuals", which hold what is not fitted, too."""
         return "slopes" if np.isinf(self.freedom) else "residuals"
 
     @property
