@@ -20,7 +20,7 @@ from tests.refusals import refused
 
 from faintspot.base.errors import MissingExtraError
 from faintspot.base.flags import VARIABLES
-from faintspot.io import file_format, open_frames, read_slopes
+from faintspot.io import file_format, read_slopes
 from faintspot.io.formats import csv_files
 
 fits = pytest.importorskip("astropy.io.fits")
@@ -111,12 +111,6 @@ def test_csv_is_written_in_pieces(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
         assert tracemalloc.get_traced_memory()[1] < 800_000
     finally:
         tracemalloc.stop()
-
-
-def test_slopes_are_read_as_frames_by_name(tmp_path: Path) -> None:
-    write(tmp_path / "slopes.fits", result())
-    with open_frames([f"{tmp_path / 'slopes.fits'}:X"]) as source:
-        assert source.shape == (50, 7)
 
 
 @pytest.mark.parametrize("name", ["flags", "centre_x"])

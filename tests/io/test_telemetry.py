@@ -43,11 +43,6 @@ def store(tmp_path: Path) -> TelemetryStore:
     return store
 
 
-def test_it_says_shortly_what_it_is(store: TelemetryStore) -> None:
-    said = repr(read_telemetry(store.path))
-    assert said == "Telemetry(15 frames, 8 sub-apertures, 2 images, 2 changes of settings)"
-
-
 def test_what_was_appended_is_read(store: TelemetryStore) -> None:
     telemetry = read_telemetry(store.path)
     written = np.concatenate([records_of(10, 5), records_of(20, 10)])

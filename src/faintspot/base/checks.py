@@ -1,7 +1,7 @@
 """Input checks on entry to every public function and on reading every file; independent random generators."""
 
 from collections.abc import Sequence
-from typing import Any, TypedDict, TypeVar, Unpack
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -84,13 +84,6 @@ def image_stack(name: str, value: object) -> NDArray[np.floating[Any]]:
     return np.ascontiguousarray(array, dtype=dtype)
 
 
-class NumberKind(TypedDict, total=False):
-    """Options of `numbers_between`."""
-
-    integer: bool
-    low_open: bool
-
-
 def numbers_between(
     name: str,
     value: object,
@@ -132,10 +125,16 @@ def _has_truth_values(value: object) -> bool:
 
 
 def number_between(
-    name: str, value: Any, low: float = -np.inf, high: float = np.inf, **kind: Unpack[NumberKind]
+    name: str,
+    value: Any,
+    low: float = -np.inf,
+    high: float = np.inf,
+    *,
+    integer: bool = False,
+    low_open: bool = False,
 ) -> float:
     """Return one number within the range, like `numbers_between`; as float (exact for whole numbers)."""
-    array = numbers_between(name, value, low, high, **kind)
+    array = numbers_between(name, value, low, high, integer=integer, low_open=low_open)
     if array.ndim:
         raise InputError(f"expected one number, got an array of shape {array.shape}", name=name)
     return float(array)

@@ -145,29 +145,22 @@ class Variable:
     dtype: str
     units: str
     long_name: str
-    csv_name: str
     if_absent: float | None = None
     """Value used if it is not given."""
 
 
 VARIABLES: Mapping[str, Variable] = {
-    "x": Variable("float32", "px", "spot position along columns, from the sub-aperture's centre", "x_px"),
-    "y": Variable("float32", "px", "spot position along rows, from the sub-aperture's centre", "y_px"),
-    "flux": Variable("float32", "e-", "flux left after background subtraction", "flux_e"),
-    "valid": Variable("bool", "1", "position was measured and is not doubtful", "valid"),
-    "flags": Variable(
-        "uint8", "1", "how a position came about, as bits: see faintspot.SubapertureFlag", "flags"
-    ),
-    "iterations": Variable("int32", "1", "iterations of the denoiser", "iterations"),
-    "bad_pixels": Variable("int32", "1", "pixels that were replaced", "bad_pixels"),
-    "standard_error_x": Variable(
-        "float32", "px", "standard error of x, infinite where not known", "standard_error_x_px", np.inf
-    ),
-    "standard_error_y": Variable(
-        "float32", "px", "standard error of y, infinite where not known", "standard_error_y_px", np.inf
-    ),
+    "x": Variable("float32", "px", "spot position along columns, from the sub-aperture's centre"),
+    "y": Variable("float32", "px", "spot position along rows, from the sub-aperture's centre"),
+    "flux": Variable("float32", "e-", "flux left after background subtraction"),
+    "valid": Variable("bool", "1", "position was measured and is not doubtful"),
+    "flags": Variable("uint8", "1", "how a position came about, as bits: see faintspot.SubapertureFlag"),
+    "iterations": Variable("int32", "1", "iterations of the denoiser"),
+    "bad_pixels": Variable("int32", "1", "pixels that were replaced"),
+    "standard_error_x": Variable("float32", "px", "standard error of x, infinite where not known", np.inf),
+    "standard_error_y": Variable("float32", "px", "standard error of y, infinite where not known", np.inf),
     "covariance_xy": Variable(
-        "float32", "px^2", "covariance of the errors of x and y, 0 where not known", "covariance_xy_px2", 0.0
+        "float32", "px^2", "covariance of the errors of x and y, 0 where not known", 0.0
     ),
 }
 

@@ -101,9 +101,10 @@ class Csv(FileFormat):
 
 
 def column_name(name: str, unit: str) -> str:
-    """Return the heading of a variable's column."""
-    variable = VARIABLES[name]
-    return variable.csv_name.replace("_px", f"_{unit}") if "px" in variable.units else variable.csv_name
+    """Return the heading of a variable's column, with the unit of positions."""
+    units = VARIABLES[name].units
+    suffix = {"1": "", "e-": "_e"}.get(units, f"_{units.replace('px', unit).replace('^', '')}")
+    return f"{name}{suffix}"
 
 
 def _numbers(lines: list[str]) -> NDArray[np.float64]:

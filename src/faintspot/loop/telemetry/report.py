@@ -22,18 +22,19 @@ from faintspot.loop.control.identification.open_loop import (
     OpenLoop,
     known_delay,
     open_loop_of,
-    outer_scale_and_r0,
     site_of_loop,
-    wind_errors,
-    winds_of,
     with_axes_of,
 )
 from faintspot.loop.control.identification.recording import Recording, prepared
-from faintspot.loop.slope_covariance import ARCSEC, SlopeTurbulence
-from faintspot.loop.telemetry.spectra import ModalSpectra, modal_spectra, recorded_discrepancy
-from faintspot.loop.turbulence_strength import differential_image_motion, turbulence_strength
+from faintspot.loop.slope_covariance import ARCSEC
+from faintspot.loop.telemetry.spectra import (
+    ModalSpectra,
+    measured_strength,
+    measured_winds,
+    modal_spectra,
+    recorded_discrepancy,
+)
 from faintspot.slopes.sensor.pupil import subapertures_across
-from faintspot.slopes.spots.shapes import R0_WAVELENGTH_M
 
 if TYPE_CHECKING:
     from faintspot.loop.control.identification.learnt_loop import ObservedLoop
@@ -45,11 +46,7 @@ _TEXT = Texts("faintspot.loop.telemetry")
 _PARTS = ("frames", "loop", "noise", "turbulence", "vibrations", "spectra", "choices")
 _OF_TURBULENCE = _PARTS[3:]
 _TIMES_AT_LIMIT = 3  # that a largest value occurs, to be taken for a limit
-_DRAWS = 1000
-_GAIN_SPREAD = 0.5  # of the deviation of the centroid gain from 1: it differs between spatial scales
 _MOST_UNMEASURED = 0.2  # of the slopes; large ones are missed most, so that the others vary too little
-_FEWEST_FOR_MOTION = 200  # frames with all slopes
-_MOSTLY = 0.8  # of the frames
 _PARABOLA_ERROR = 0.03  # of the noise: turbulence and speckles within two frames are no parabola
 
 
@@ -289,11 +286,11 @@ def _turbulence(report: LoopReport, open_loop: OpenLoop, delay: LoopDelay) -> Id
     if loop.subaperture_m is None:
         part.missing = "Without subaperture_m (or diameter_m) neither r0 nor winds are known."
         return identification
-    strength = _strength(loop, open_loop, delay, replace(identified.turbulence, r0_m=site.r0_m))
+    strength = measured_strength(loop, open_loop, delay, replace(identified.turbulence, r0_m=site.r0_m))
     part.values += strength
     if not math.isfinite(strength[0].value) and len(strength) == 1:
         return identification
-    part.values += _winds(identified, next(value for value in strength if value.name == R0))
+    part.values += measured_winds(identified, next(value for value in strength if value.name == R0))
     return identification
 
 
@@ -312,74 +309,6 @@ def _mirror(report: LoopReport, open_loop: OpenLoop, identified: Identified) -> 
     matrix = MovableMatrix(loop.cells, loop.interaction_matrix)
     found = misregistration(loop, delay, matrix, SlopePredictor(identified.slope_model(), noise))
     report.parts["loop"].values += found.measured()
-
-
-def _strength(
-    loop: Recording, open_loop: OpenLoop, delay: LoopDelay, site: SlopeTurbulence
-) -> list[Measured]:
-    """Return outer scale, r0, r0 as of a seeing monitor, and the seeing."""
-    if loop.pixel_scale_arcsec is None:
-        return [Measured(R0, "m", remark="pixel_scale_arcsec is unknown")]
-    if loop.is_closed:  # a matrix of mean gradients makes of what the mirror corrects mean gradients, too
-        site = replace(site, averaged=0.5 * (1 + site.averaged))
-    rows = open_loop.telemetry.trust.any(axis=1)
-    strength = turbulence_strength(
-        open_loop.telemetry.open_loop_px[rows],
-        open_loop.residual[rows],
-        open_loop.run[rows],
-        site,
-        gain_error=delay.gain_error / delay.gain,
-        gain_spread=_GAIN_SPREAD * abs(1 - delay.gain),
-        outer_scale_m=loop.outer_scale_m,
-        frame_rate_hz=loop.frame_rate_hz,
-    )
-    if not math.isfinite(strength.r0_m):
-        return [Measured(R0, "m", remark="no turbulence seen: the slopes are those of noise")]
-    outer, r0 = outer_scale_and_r0(strength, loop.outer_scale_m)
-    if not loop.is_closed:
-        r0 = replace(r0, remark=f"for a centroid gain of 1 ± {delay.gain_error:.2g}")
-    values = [outer, r0, *_image_motion(open_loop, site, loop.frame_rate_hz, delay.gain_error / delay.gain)]
-    seeing = 0.98 * R0_WAVELENGTH_M / strength.r0_m / ARCSEC
-    relative = strength.r0_error_m / strength.r0_m
-    return [*values, Measured("seeing at 500 nm", "arcsec", seeing, seeing * relative, "0.98 λ / r0", True)]
-
-
-def _image_motion(
-    open_loop: OpenLoop, site: SlopeTurbulence, rate_hz: float, gain_error: float
-) -> list[Measured]:
-    """Return r0 as a seeing monitor measures it, from the sub-apertures that were measured in most frames."""
-    measured = open_loop.telemetry.trust > 0
-    kept = measured.mean(axis=0).reshape(2, -1).min(axis=0) > _MOSTLY
-    columns = np.tile(kept, 2)
-    slopes = open_loop.telemetry.open_loop_px[measured[:, columns].all(axis=1)][:, columns]
-    if len(slopes) < _FEWEST_FOR_MOTION:
-        return []
-    site = replace(site, positions_m=site.positions_m[kept])
-    r0, error = differential_image_motion(slopes, open_loop.variance[columns], site, rate_hz)
-    error = math.hypot(error, 6 / 5 * gain_error * r0)
-    remark = "as of a seeing monitor, for an infinite outer scale"
-    return [Measured("r0 at 500 nm from differential image motion", "m", r0, error, remark, True)]
-
-
-def _winds(identified: Identified, r0: Measured) -> list[Measured]:
-    """Return coherence time, mean wind speed, and each layer's speed, direction and share."""
-    turbulence = identified.turbulence
-    winds, share = turbulence.wind_m_per_s, turbulence.fraction
-    errors = wind_errors(identified)
-    rng = np.random.default_rng(1)
-    drawn = winds + errors * rng.standard_normal((_DRAWS, *winds.shape))
-    weight = np.maximum(share + identified.fraction_error * rng.standard_normal((_DRAWS, len(share))), 1e-6)
-    speeds = np.hypot(drawn[..., 0], drawn[..., 1])
-    mean = ((weight * speeds ** (5 / 3)).sum(axis=1) / weight.sum(axis=1)) ** 0.6
-    speed = float((share @ np.hypot(*winds.T) ** (5 / 3)) ** 0.6)
-    values = [Measured("wind speed, mean for the coherence time", "m/s", speed, float(mean.std()))]
-    if math.isfinite(r0.value):
-        time_ms = 314 * r0.value / speed
-        error = time_ms * math.hypot(r0.error / r0.value, float(mean.std()) / speed)
-        values.append(Measured("coherence time at 500 nm", "ms", time_ms, error))
-    for rank, wind in enumerate(winds_of(identified), 1):
-        values += [replace(value, name=f"layer {rank}: {value.name}") for value in vars(wind).values()]
-    return values
 
 
 def _vibrations(report: LoopReport, identified: Identified) -> None:
