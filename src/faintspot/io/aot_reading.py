@@ -89,12 +89,9 @@ class AotSensor:
 
     def __repr__(self) -> str:
         """Return the name, the number of sub-apertures and the available data."""
-        what = [name for name in ("layout", "pixels", "slopes", "reference", "interaction") if self.has(name)]
+        names = ("layout", "pixels", "slopes", "reference", "interaction")
+        what = [name for name in names if getattr(self, name) is not None]
         return f"AotSensor({self.name!r}, {self.n} sub-apertures, {', '.join(what) or 'no data'})"
-
-    def has(self, name: str) -> bool:
-        """Return whether the file holds a quantity."""
-        return getattr(self, name) is not None
 
 
 def read_aot(path: str | Path, sensor: str | None = None) -> AotSensor:

@@ -15,6 +15,7 @@ from faintspot.base.errors import InputError, errors_within
 from faintspot.io.fits_units import units_of
 from faintspot.io.formats.csv_files import TEXTS
 from faintspot.io.frames import frame_format, read_array
+from faintspot.io.stored_array import listed
 
 _KECK_TICK_S = 1e-7
 
@@ -139,7 +140,6 @@ LAYOUTS: tuple[TelemetryLayout, ...] = (
 _TABLES = (".fits.gz", ".fits", ".sav")
 _ENDINGS = (*_TABLES, ".fits.fz", ".npy", *TEXTS)
 _MOST_FILES = 1 << 14
-_LISTED = 12  # arrays in a message
 _OPEN = ("F", "FALSE", "OPEN", "0")
 
 Names = Mapping[str, str]  # locations for `read_array`, by the names of arrays
@@ -176,14 +176,14 @@ def read_layout(path: Path, named: Mapping[str, str]) -> dict[str, Any]:
         if len(tables) == 1:
             return read_layout(tables[0], named)
         if tables:
-            listed = _listed(file.name for file in tables)
-            raise InputError(f"{path}: expected one table of a loop; name one as FILE: {listed}")
+            names_of = listed(file.name for file in tables)
+            raise InputError(f"{path}: expected one table of a loop; name one as FILE: {names_of}")
     if chosen is not None:
         layouts = [layout for layout in layouts if chosen.upper() == layout.slopes[0].upper()]
         layouts = layouts or _timed(names, chosen)
     if len(layouts) > 1:
-        listed = _listed(layout.slopes[0] for layout in layouts)
-        raise InputError(f"{path}: has {len(layouts)} loops; choose one with --slopes: {listed}")
+        choices = listed(layout.slopes[0] for layout in layouts)
+        raise InputError(f"{path}: has {len(layouts)} loops; choose one with --slopes: {choices}")
     values: dict[str, Any] = {"origin": "arrays", "sources": {}}
     if layouts:
         layout = layouts[0]
@@ -193,7 +193,7 @@ def read_layout(path: Path, named: Mapping[str, str]) -> dict[str, Any]:
     elif chosen is None and (path.is_dir() or len(names) > 1):
         raise InputError(
             f"{path}: expected a known layout of telemetry; name an array with --slopes, and one with "
-            f"--commands: {_listed(names) or 'none'}"
+            f"--commands: {listed(names)}"
         )
     elif chosen is None:
         values["slopes"] = read_array(path)
@@ -262,14 +262,8 @@ def _located(path: Path, names: Names, text: str) -> str:
         if whole.exists() or Path(f"{whole}".rpartition(":")[0]).is_file():
             return f"{whole}"
     if names:
-        raise InputError(f"{text}: expected a file, or an array of {path}: {_listed(names)}")
+        raise InputError(f"{text}: expected a file, or an array of {path}: {listed(names)}")
     return f"{path}:{text}"
-
-
-def _listed(names: Iterable[str]) -> str:
-    listed = list(names)
-    more = f" and {len(listed) - _LISTED} more" if len(listed) > _LISTED else ""
-    return f"{', '.join(listed[:_LISTED])}{more}"
 
 
 class _Reader:

@@ -17,11 +17,11 @@ from faintspot.base.errors import InputError
 from faintspot.base.files import check_bytes, check_regular, memory_bytes
 from faintspot.base.text_files import parse_json
 from faintspot.io.frames import read_array
+from faintspot.io.stored_array import listed
 
 _ENDING = re.compile(r"\.fits(\.fz|\.gz)?$")
 _STAMP = re.compile(r"_\d\d:\d\d:\d\d(\.\d+)?$")
 _LOGGED, _ACQUIRED, _COUNTER, _COLUMNS = 3, 4, 5, 7
-_MOST_LISTED = 12
 
 
 class Stream(NamedTuple):
@@ -61,9 +61,8 @@ def read_streams(path: Path, named: Mapping[str, str]) -> dict[str, Any]:
     others = [name for name in streams if name not in named.values()]
     name = named.get("slopes", others[0] if len(others) == 1 else "")
     if not name:
-        listed = ", ".join(list(streams)[:_MOST_LISTED])
         raise InputError(
-            f"{path}: has {len(streams)} streams; name that of the slopes with --slopes: {listed}"
+            f"{path}: has {len(streams)} streams; name that of the slopes with --slopes: {listed(streams)}"
         )
     slopes = _read(path, streams, name)
     sources = {"slopes": name, "frame": "cnt0", "time_s": "its times of acquisition"}
@@ -114,8 +113,9 @@ def _read(path: Path, streams: Mapping[str, list[Path]], name: str) -> Stream:
     places = [place for place in (Path(name), folder / name, folder.parent / name) if place.exists()]
     cubes = streams.get(name) or (_cubes(places[0]) if places else [])
     if not cubes:
-        listed = ", ".join(list(streams)[:_MOST_LISTED])
-        raise InputError(f"{name}: expected a stream with its timing; the streams of {path} are: {listed}")
+        raise InputError(
+            f"{name}: expected a stream with its timing; the streams of {path} are: {listed(streams)}"
+        )
     parts, total = [], 0
     for cube in cubes:
         frames, timing = read_array(cube), read_array(_timing_of(cube))
@@ -176,8 +176,8 @@ def read_session(path: Path) -> dict[str, Any]:
         When a file is missing or damaged, or the streams have no frames in common.
     """
     try:
-        listed = parse_json((path / _MANIFEST).read_text(encoding="utf-8"))["streams"]
-        streams = {record["name"]: record for record in listed}
+        records = parse_json((path / _MANIFEST).read_text(encoding="utf-8"))["streams"]
+        streams = {record["name"]: record for record in records}
     except (OSError, ValueError, TypeError, KeyError):
         raise InputError(
             f"{path}: expected a session of pyRTC's telemetry, got a damaged {_MANIFEST}"

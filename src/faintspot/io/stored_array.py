@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,7 @@ from faintspot.base.errors import InputError, MissingExtraError
 from faintspot.base.files import Closing, check_bytes
 
 PREFERRED_NAME = "frames"
-_MOST_LISTED = 20
+_MOST_LISTED = 12
 
 
 def split_location(location: str | Path) -> tuple[Path, str | None]:
@@ -44,6 +44,13 @@ def _exists(path: Path) -> bool:
         return False
 
 
+def listed(names: Iterable[str]) -> str:
+    """Return names with commas for a message, of many the first and the number of the others."""
+    items = list(names)
+    more = f" and {len(items) - _MOST_LISTED} more" if len(items) > _MOST_LISTED else ""
+    return f"{', '.join(items[:_MOST_LISTED]) or 'none'}{more}"
+
+
 def choose_name(path: Path, dimensions: Mapping[str, int], key: str | None) -> str:
     """Return the name of the array to read: `key`, or "frames", or the only 2-D or 3-D one.
 
@@ -61,12 +68,9 @@ def choose_name(path: Path, dimensions: Mapping[str, int], key: str | None) -> s
     InputError
         When there is no such array, or several and none is requested.
     """
-    listed = ", ".join(list(dimensions)[:_MOST_LISTED]) or "none"
-    if len(dimensions) > _MOST_LISTED:
-        listed += f" and {len(dimensions) - _MOST_LISTED} more"
     if key is not None:
         if key not in dimensions:
-            raise InputError(f"{path}: no array {key!r}; it contains: {listed}")
+            raise InputError(f"{path}: no array {key!r}; it contains: {listed(dimensions)}")
         return key
     if PREFERRED_NAME in dimensions:
         return PREFERRED_NAME
@@ -75,7 +79,7 @@ def choose_name(path: Path, dimensions: Mapping[str, int], key: str | None) -> s
     if len(images) != 1:
         raise InputError(
             f"{path}: expected one array of frames, or one named 'frames'; "
-            f"it contains: {listed}; choose one with {path.name}:NAME"
+            f"it contains: {listed(dimensions)}; choose one with {path.name}:NAME"
         )
     return images[0]
 

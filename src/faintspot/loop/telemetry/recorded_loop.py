@@ -287,8 +287,7 @@ def _loop(name: str, values: dict[str, Any], given: list[str]) -> Recording:
         )
     has_cells = not (isinstance(cells, str) and cells == _NO_CELLS)
     diameter_m = numbers.pop("diameter_m", None)
-    known: dict[str, Any] = {**numbers, "pixel_scale_arcsec": scale}
-    known["frame_rate_hz"] = rate
+    known: dict[str, Any] = {**numbers, "pixel_scale_arcsec": scale, "frame_rate_hz": rate}
     loop = Recording(
         slopes,
         values.get("commands"),
@@ -300,12 +299,11 @@ def _loop(name: str, values: dict[str, Any], given: list[str]) -> Recording:
         slope_unit=unit,
         name=name,
     )
-    if not has_cells:
-        return replace(loop, remarks=(*remarks, *_unknown(loop, values)))
-    slopes, left_out = _usable(loop.slopes, values.get("flags"))
-    remarks += [f"slopes: {left_out}"] if left_out else []
-    side = side_m(loop.cells, loop.subaperture_m, diameter_m, values.get("flags"))
-    loop = replace(loop, slopes=slopes, subaperture_m=side)
+    if has_cells:
+        slopes, left_out = _usable(loop.slopes, values.get("flags"))
+        remarks += [f"slopes: {left_out}"] if left_out else []
+        side = side_m(loop.cells, loop.subaperture_m, diameter_m, values.get("flags"))
+        loop = replace(loop, slopes=slopes, subaperture_m=side)
     return replace(loop, remarks=(*remarks, *_unknown(loop, values)))
 
 
