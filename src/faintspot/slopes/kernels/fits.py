@@ -64,7 +64,7 @@ class ModelTables(NamedTuple):
     taps: Any
     """(n_subapertures, 2, 1 + reach) float32: of the smoothing that finds the start."""
     model: Any
-    """(n_models, 2, rank, 2, PHASES, length) float32: see `profiles.look_up`."""
+    """(n_models, 2, rank, 2, PHASES, length) float32: see `spot_rows.look_up`."""
 
 
 class PosteriorTables(NamedTuple):
@@ -73,10 +73,13 @@ class PosteriorTables(NamedTuple):
     fit: Any
     """ModelTables."""
     logarithms: Any
-    """Arguments `constants`, `grid` and `spacing` of `posterior_of_group`."""
+    """(n_tables, n_positions, ny, n_vectors * W) float32: k_p of each table and position, 0 beyond nx."""
     constants: Any
+    """(n_tables, n_positions) float32: c_p."""
     grid: Any
+    """(n_positions, 2) float32: x and y, px."""
     spacing: Any
+    """Of the grid, px."""
 
 
 class SpotScratch(NamedTuple):
@@ -84,12 +87,19 @@ class SpotScratch(NamedTuple):
 
     taps: Any
     lane_values: Any
+    """(LANE_ROWS * W,)."""
     profiles: Any
+    """(2, rank, 2, padded, W): of the first nx or ny of `padded` pixels."""
     rows: Any
+    """(ny, n_vectors, W, W)."""
     logarithms: Any
+    """(n_positions,) float64."""
     starts: Any
+    """(W,) int64: free for any use."""
     models: Any
+    """(W,) int64: model of each lane in `ModelTables.model`."""
     kinds: Any
+    """(W,) int64: table of each lane in `PosteriorTables.logarithms`."""
 
 
 def spot_scratch(
@@ -115,20 +125,7 @@ def locate_weighted(group: Any, tables: Any, scratch: Any, stages: Any) -> None:
     own = scratch.own
     _begin(group, scratch)
     _begin_at_peak(group, tables.taps, scratch)
-    weigh_group(
-        group.lanes,
-        scratch.image,
-        group.variances,
-        group.first * group.ny * group.nx,
-        group.ny,
-        group.nx,
-        tables.model,
-        own.models,
-        tables.steps,
-        own.lane_values,
-        own.starts,
-        own.profiles,
-    )
+    weigh_group(group, tables, scratch.image, own)
     _finish(group, tables.steps, False, scratch)
 
 
@@ -166,21 +163,7 @@ def locate_posterior(group: Any, tables: Any, scratch: Any, stages: Any) -> None
     if tables.fit.background:
         flux = load(lanes, own.lane_values, spot_rows.FLUX * width)
         subtract_background(lanes, scratch.image, pixels, flux)
-    posterior_of_group(
-        group.lanes,
-        scratch.image,
-        group.ny,
-        group.nx,
-        tables.logarithms,
-        tables.constants,
-        tables.grid,
-        tables.spacing,
-        own.kinds,
-        own.lane_values,
-        own.starts,
-        own.rows,
-        own.logarithms,
-    )
+    posterior_of_group(group, tables, scratch.image, own)
     _begin_at_mean_or_peak(width, own.lane_values)
     _fit(group, tables.fit, scratch)
     _keep_broad_posteriors(width, own.lane_values)
@@ -259,21 +242,7 @@ def _fit(group: Any, tables: Any, scratch: Any) -> None:
         lane_values[spot_rows.WEIGHT_EXCESS * width + lane] = settings[WEIGHT_EXCESS, s]
         most = MOST_MODEL_ERROR_E / lane_values[spot_rows.FLUX * width + lane]
         lane_values[spot_rows.MODEL_ERROR * width + lane] = min(settings[MODEL_ERROR, s] ** 2, most)
-    fit_group(
-        group.lanes,
-        scratch.image,
-        group.variances,
-        group.first * group.ny * group.nx,
-        group.ny,
-        group.nx,
-        tables.model,
-        own.models,
-        tables.steps,
-        tables.background,
-        lane_values,
-        own.starts,
-        own.profiles,
-    )
+    fit_group(group, tables, scratch.image, own)
 
 
 @compiled

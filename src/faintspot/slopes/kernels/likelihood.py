@@ -30,12 +30,10 @@ LEAST_FLUX_E = 1e-2
 
 
 @compiled
-def _separable_sums(
-    lanes: Any, image: Any, variances: Any, place: Any, ny: Any, nx: Any, profiles: Any, lane_values: Any
-) -> None:
+def _separable_sums(group: Any, image: Any, own: Any) -> None:
     """Sum score, information and the score's covariance of every lane for a PSF of one separable term."""
-    width = width_of(lanes)
-    padded = profiles.shape[3]
+    lanes, ny, nx, profiles, lane_values = group.lanes, group.ny, group.nx, own.profiles, own.lane_values
+    width, place, padded = width_of(lanes), group.first * ny * nx, profiles.shape[3]
     zero = splat(lanes, 0.0)
     noise, flux = noise_of(lanes, lane_values), load(lanes, lane_values, row.FLUX * width)
     sx, sy, sf = zero, zero, zero
@@ -49,7 +47,7 @@ def _separable_sums(
             fx, dx = load(lanes, profiles, x * width), load(lanes, profiles, (padded + x) * width)
             m = fx * fy
             at = (y * nx + x) * width
-            w, wt = weigh(lanes, noise, variances, place + at, m)
+            w, wt = weigh(lanes, noise, group.variances, place + at, m)
             r = load(lanes, image, at) - m
             wf, wd = w * fx, w * dx
             s0, s1 = multiply_add(r, wf, s0), multiply_add(r, wd, s1)
@@ -67,11 +65,10 @@ def _separable_sums(
 
 
 @compiled
-def _general_sums(
-    lanes: Any, image: Any, variances: Any, place: Any, ny: Any, nx: Any, profiles: Any, lane_values: Any
-) -> None:
+def _general_sums(group: Any, image: Any, own: Any) -> None:
     """Sum as `_separable_sums`, for a PSF of several separable terms."""
-    width = width_of(lanes)
+    lanes, ny, nx, profiles, lane_values = group.lanes, group.ny, group.nx, own.profiles, own.lane_values
+    width, place = width_of(lanes), group.first * ny * nx
     zero = splat(lanes, 0.0)
     noise, flux = noise_of(lanes, lane_values), load(lanes, lane_values, row.FLUX * width)
     sx, sy, sf = zero, zero, zero
@@ -82,7 +79,7 @@ def _general_sums(
             m, mx, my = model_at(lanes, profiles, x, y)
             m, mx, my = flux * m, flux * mx, flux * my
             at = (y * nx + x) * width
-            w, wt = weigh(lanes, noise, variances, place + at, m)
+            w, wt = weigh(lanes, noise, group.variances, place + at, m)
             wr = w * (load(lanes, image, at) - m)
             sx, sy, sf = multiply_add(wr, mx, sx), multiply_add(wr, my, sy), multiply_add(wr, m, sf)
             wx, wy, wm = w * mx, w * my, w * m
@@ -199,48 +196,30 @@ def _store_errors(width: Any, lane: Any, flux: Any, lane_values: Any) -> None:
 
 
 @compiled
-def fit_group(
-    lanes: Any,
-    image: Any,
-    variances: Any,
-    place: Any,
-    ny: Any,
-    nx: Any,
-    tables: Any,
-    which: Any,
-    steps: Any,
-    background: Any,
-    lane_values: Any,
-    starts: Any,
-    profiles: Any,
-) -> None:
+def fit_group(group: Any, tables: Any, image: Any, own: Any) -> None:
     """Fit position and flux of the W spots of a group.
 
     Parameters
     ----------
+    group : Group
+        Its variances stand in place of VARIANCE, also in the weights.
+    tables : ModelTables
+        Always as many steps, so that the time is known and lanes do not depend on each other.
     image : (ny * nx * W,)
-    variances, place
-        See `pixel_noise`; in place of VARIANCE, also in the weights.
-    tables, which, starts, profiles
-        See `look_up`.
-    steps : int
-        Always as many, so that the time is known and lanes do not depend on each other.
-    background : bool
-        Whether a constant is fitted along.
-    lane_values : (LANE_ROWS * W,)
-        The start (X, Y, FLUX) and everything marked "in" is read; position, flux, errors and
+    own : SpotScratch
+        In its rows, the start (X, Y, FLUX) and everything marked "in" is read; position, flux, errors and
         what is SEEN are written.
     """
-    width = width_of(lanes)
-    for step in range(steps):
-        look_up(lanes, tables, which, ny, nx, lane_values, starts, profiles)
-        if profiles.shape[1] == 1:
-            _separable_sums(lanes, image, variances, place, ny, nx, profiles, lane_values)
+    for step in range(tables.steps):
+        look_up(group, tables.model, own)
+        if own.profiles.shape[1] == 1:
+            _separable_sums(group, image, own)
         else:
-            _general_sums(lanes, image, variances, place, ny, nx, profiles, lane_values)
-        if background:
-            eliminate_background(lanes, image, variances, place, ny, nx, profiles, lane_values)
-        if step == steps - 1:
+            _general_sums(group, image, own)
+        if tables.background:
+            eliminate_background(group, image, own)
+        if step == tables.steps - 1:
+            width = width_of(group.lanes)
             for lane in range(width):
-                _store_errors(width, lane, float(lane_values[row.FLUX * width + lane]), lane_values)
-        _move(lanes, lane_values)
+                _store_errors(width, lane, float(own.lane_values[row.FLUX * width + lane]), own.lane_values)
+        _move(group.lanes, own.lane_values)

@@ -25,10 +25,10 @@ LEAST_FRACTION = 0.05  # of the flux at the start: less under the weight would o
 
 
 @compiled
-def _move(lanes: Any, image: Any, ny: Any, nx: Any, profiles: Any, floor: Any, lane_values: Any) -> None:
+def _move(group: Any, image: Any, floor: Any, own: Any) -> None:
     """Move every lane by the weighted centre of gravity of its image, seen from where it is."""
-    width = width_of(lanes)
-    padded = profiles.shape[3]
+    lanes, ny, nx, profiles, lane_values = group.lanes, group.ny, group.nx, own.profiles, own.lane_values
+    width, padded = width_of(lanes), profiles.shape[3]
     zero = splat(lanes, 0.0)
     x0, y0 = load(lanes, lane_values, row.X * width), load(lanes, lane_values, row.Y * width)
     total, moment_x, moment_y = zero, zero, zero
@@ -58,20 +58,10 @@ def _move(lanes: Any, image: Any, ny: Any, nx: Any, profiles: Any, floor: Any, l
 
 
 @compiled
-def _store_errors(
-    lanes: Any,
-    image: Any,
-    variances: Any,
-    place: Any,
-    ny: Any,
-    nx: Any,
-    profiles: Any,
-    floor: Any,
-    lane_values: Any,
-) -> None:
+def _store_errors(group: Any, image: Any, floor: Any, own: Any) -> None:
     """Propagate the pixels' noise, VARIANCE (or `variances`) + EXCESS * g, through the last step."""
-    width = width_of(lanes)
-    padded = profiles.shape[3]
+    lanes, ny, nx, profiles, lane_values = group.lanes, group.ny, group.nx, own.profiles, own.lane_values
+    width, place, padded = width_of(lanes), group.first * ny * nx, profiles.shape[3]
     zero = splat(lanes, 0.0)
     v, e = load(lanes, lane_values, row.VARIANCE * width), load(lanes, lane_values, row.EXCESS * width)
     x0, y0 = load(lanes, lane_values, row.X * width), load(lanes, lane_values, row.Y * width)
@@ -86,12 +76,12 @@ def _store_errors(
             away_x = splat(lanes, x - 0.5 * (nx - 1)) - x0
             total = multiply_add(weight, g, total)
             square = weight * weight
-            variance = square * multiply_add(g, e, variance_of(lanes, variances, place + at, v))
+            variance = square * multiply_add(g, e, variance_of(lanes, group.variances, place + at, v))
             noise = noise + variance
             noise_x = multiply_add(variance * away_x, away_x, noise_x)
             noise_y = multiply_add(variance * away_y, away_y, noise_y)
             noise_xy = multiply_add(variance * away_x, away_y, noise_xy)
-            dark = square * relative_variance(lanes, variances, place + at, v)
+            dark = square * relative_variance(lanes, group.variances, place + at, v)
             dark_x = multiply_add(dark * away_x, away_x, dark_x)
             dark_y = multiply_add(dark * away_y, away_y, dark_y)
     least = splat(lanes, SMALLEST_VARIANCE)
@@ -119,30 +109,17 @@ def _store_errors(
 
 
 @compiled
-def weigh_group(
-    lanes: Any,
-    image: Any,
-    variances: Any,
-    place: Any,
-    ny: Any,
-    nx: Any,
-    tables: Any,
-    which: Any,
-    steps: Any,
-    lane_values: Any,
-    starts: Any,
-    profiles: Any,
-) -> None:
+def weigh_group(group: Any, tables: Any, image: Any, own: Any) -> None:
     """Follow the W spots of a group with a weight; parameters as `likelihood.fit_group`.
 
     The tables hold the weight's profile, 1 at its centre.
     """
-    width = width_of(lanes)
-    floor = splat(lanes, LEAST_FRACTION) * load(lanes, lane_values, row.FLUX * width)
-    for _ in range(steps):
-        look_up(lanes, tables, which, ny, nx, lane_values, starts, profiles)
-        _move(lanes, image, ny, nx, profiles, floor, lane_values)
-    _store_errors(lanes, image, variances, place, ny, nx, profiles, floor, lane_values)
+    flux = load(group.lanes, own.lane_values, row.FLUX * width_of(group.lanes))
+    floor = splat(group.lanes, LEAST_FRACTION) * flux
+    for _ in range(tables.steps):
+        look_up(group, tables.model, own)
+        _move(group, image, floor, own)
+    _store_errors(group, image, floor, own)
 
 
 @compiled
@@ -205,48 +182,22 @@ def _log_likelihood(lanes: Any, rows: Any, lane: Any, tables: Any, table: Any, p
 
 
 @compiled
-def posterior_of_group(
-    lanes: Any,
-    image: Any,
-    ny: Any,
-    nx: Any,
-    tables: Any,
-    constants: Any,
-    grid: Any,
-    spacing: Any,
-    which: Any,
-    lane_values: Any,
-    starts: Any,
-    rows: Any,
-    values: Any,
-) -> None:
+def posterior_of_group(group: Any, tables: Any, image: Any, own: Any) -> None:
     """Write mean, standard deviation and covariance of the posterior of the W spots of a group.
 
     Parameters
     ----------
+    group : Group
+    tables : PosteriorTables
     image : (>= ny * nx * W + W,)
-    tables : (n_tables, n_positions, ny, n_vectors * W) float32
-        k_p, zero beyond nx.
-    constants : (n_tables, n_positions) float32
-        c_p.
-    grid : (n_positions, 2) float32
-        x and y, px.
-    spacing : float
-        Of the grid, px.
-    which : (W,) int64
-        Table of each lane.
-    lane_values : (LANE_ROWS * W,)
-        Allowed positions and prior are read.
-    starts : (W,) int64
-        Scratch.
-    rows : (ny, n_vectors, W, W)
-        Scratch.
-    values : (n_positions,) float64
-        Scratch.
+    own : SpotScratch
+        In its rows, allowed positions and prior are read.
     """
+    lanes, lane_values, rows, values = group.lanes, own.lane_values, own.rows, own.logarithms
+    constants, grid, spacing, which = tables.constants, tables.grid, tables.spacing, own.kinds
     width = width_of(lanes)
     n = grid.shape[0]
-    rows_from_lanes(lanes, image, ny, nx, starts, rows)
+    rows_from_lanes(lanes, image, group.ny, group.nx, own.starts, rows)
     for lane in range(width):
         low_x, high_x = lane_values[row.LOW_X * width + lane], lane_values[row.HIGH_X * width + lane]
         low_y, high_y = lane_values[row.LOW_Y * width + lane], lane_values[row.HIGH_Y * width + lane]
@@ -262,7 +213,7 @@ def posterior_of_group(
             values[i] = -math.inf
             away_x, away_y = (x - prior_x) ** 2 * prior, (y - prior_y) ** 2 * prior
             if share_x > 0.0 and share_y > 0.0 and max(away_x, away_y) <= REACH * REACH:
-                value = _log_likelihood(lanes, rows, lane, tables, which[lane], i)
+                value = _log_likelihood(lanes, rows, lane, tables.logarithms, which[lane], i)
                 value += constants[which[lane], i] - 0.5 * (away_x + away_y)
                 values[i] = value
                 largest = max(largest, value)

@@ -99,14 +99,13 @@ def subtract_background(lanes: Any, image: Any, pixels: Any, flux: Any) -> None:
 
 
 @compiled
-def eliminate_background(
-    lanes: Any, image: Any, variances: Any, place: Any, ny: Any, nx: Any, profiles: Any, lane_values: Any
-) -> None:
+def eliminate_background(group: Any, image: Any, own: Any) -> None:
     """Turn the sums of a fit of x, y and the flux into those of a fit that has a constant as well.
 
     Parameters as `likelihood.fit_group`; SCORE_*, I_* and J_* are read and written.
     """
-    width = width_of(lanes)
+    lanes, ny, nx, profiles, lane_values = group.lanes, group.ny, group.nx, own.profiles, own.lane_values
+    width, place = width_of(lanes), group.first * ny * nx
     zero = splat(lanes, 0.0)
     noise, flux = noise_of(lanes, lane_values), load(lanes, lane_values, FLUX * width)
     s, i, ix, iy, im, j, jx, jy, jm = zero, zero, zero, zero, zero, zero, zero, zero, zero
@@ -115,7 +114,7 @@ def eliminate_background(
             m, mx, my = model_at(lanes, profiles, x, y)
             m = flux * m
             at = (y * nx + x) * width
-            w, wt = weigh(lanes, noise, variances, place + at, m)
+            w, wt = weigh(lanes, noise, group.variances, place + at, m)
             s = multiply_add(w, load(lanes, image, at) - m, s)
             i, im = i + w, multiply_add(w, m, im)
             ix, iy = multiply_add(w, mx, ix), multiply_add(w, my, iy)
@@ -157,27 +156,20 @@ MARGIN = 2  # px that a table reaches beyond the window's side, on either end
 
 
 @compiled
-def look_up(
-    lanes: Any, tables: Any, which: Any, ny: Any, nx: Any, lane_values: Any, starts: Any, profiles: Any
-) -> None:
+def look_up(group: Any, tables: Any, own: Any) -> None:
     """Write every lane's profiles, and their derivatives in the position, at its position X, Y.
 
     Parameters
     ----------
-    lanes : Lanes
+    group : Group
     tables : (n_models, 2, rank, 2, PHASES, length) float32
         Axis (x, y), term, value or derivative, phase, place: element i of phase p belongs to the offset
         i - MARGIN - max(ny, nx) + p / PHASES from the spot.
-    which : (W,) int64
-        Model of each lane.
-    ny, nx : int
-    lane_values : (LANE_ROWS * W,)
-        X and Y are read, REST_X and REST_Y written.
-    starts : (W,) int64
-        Scratch.
-    profiles : (2, rank, 2, padded, W) float32
-        Written for the first nx or ny of `padded` pixels.
+    own : SpotScratch
+        Models and X and Y are read; REST_X, REST_Y and profiles are written.
     """
+    lanes, ny, nx = group.lanes, group.ny, group.nx
+    lane_values, starts, profiles = own.lane_values, own.starts, own.profiles
     width = width_of(lanes)
     rank, length, padded = tables.shape[2], tables.shape[5], profiles.shape[3]
     margin = MARGIN + max(ny, nx)
@@ -191,7 +183,9 @@ def look_up(
             position = lane_values[(REST_X + axis) * width + lane]
             step = math.floor((first - position) * PHASES + 0.5)
             whole, phase = step // PHASES, step % PHASES
-            starts[lane] = ((which[lane] * 2 + axis) * rank * 2 * PHASES + phase) * length + whole + margin
+            starts[lane] = (
+                ((own.models[lane] * 2 + axis) * rank * 2 * PHASES + phase) * length + whole + margin
+            )
             lane_values[(REST_X + axis) * width + lane] = position - (first - step / PHASES)
         rest = load(lanes, lane_values, (REST_X + axis) * width)
         for term in range(rank):
