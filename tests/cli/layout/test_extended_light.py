@@ -97,12 +97,6 @@ def test_flat_field_corrects_a_colour_mosaic(folder: Path, run: Commands) -> Non
 
 
 @pytest.mark.usefixtures("no_trials")
-def test_equal_pixels_are_no_mosaic(folder: Path, run: Commands) -> None:
-    np.save("a.npy", mosaic_frames((0.9, 1.0, 1.0, 0.9)))
-    run.ok("layout", "a.npy", "-o", "new.toml")
-
-
-@pytest.mark.usefixtures("no_trials")
 @pytest.mark.parametrize("kind", ["offset", "pattern", "with light"])
 def test_a_dark_never_makes_a_layout_worse(folder: Path, run: Commands, kind: str) -> None:
     """The same windows as without a dark, except for single ones at the pupil's edge."""

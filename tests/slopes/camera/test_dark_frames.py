@@ -57,14 +57,6 @@ class TestNoise:
         assert np.all(pixels.noise_adu == 0)
         assert not len(pixels.blinking)
 
-    def test_drift_is_no_noise(self) -> None:
-        """All pixels of a frame rise and fall together."""
-        darks = np.random.default_rng(4).normal(0.0, 1.0, (40, *SHAPE))
-        darks += np.linspace(-20, 20, 40)[:, None, None]
-        pixels = fs.measure_detector(darks=darks).pixels
-        assert pixels is not None
-        assert np.median(pixels.noise_adu) == pytest.approx(1.0, rel=0.02)
-
 
 class TestBlinking:
     def test_pixels_of_two_levels_are_found(self) -> None:

@@ -171,9 +171,3 @@ def test_wrong_values_are_refused() -> None:
         range_adu=[(2.0, 1.0), (5.0, 9.0)],
         dark_level_adu=[np.inf],
     )
-
-
-def test_a_camera_that_is_stuck_has_no_gain() -> None:
-    """One frame again and again."""
-    frame = np.random.default_rng(4).poisson(50.0, (40, 40))
-    assert np.isnan(measure_detector(np.tile(frame, (20, 1, 1))).gain_e_per_adu.value)
