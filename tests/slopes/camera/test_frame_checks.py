@@ -56,13 +56,10 @@ def test_known_bad_pixels_are_left_out_and_the_frame_is_not_changed() -> None:
     assert len(find_hot_pixels(np.full((5, 5), np.nan))) == 0
 
 
-@pytest.mark.parametrize(
-    ("frame", "threshold", "named"),
-    [(np.zeros(3), 8, "frame"), (np.zeros((2, 3, 3)), 8, "frame"), (np.zeros((3, 3)), 0, "threshold")],
-)
-def test_hot_pixels_need_a_frame_and_a_threshold(frame: object, threshold: float, named: str) -> None:
-    with pytest.raises(fs.InputError, match=named):
-        find_hot_pixels(frame, threshold=threshold)  # type: ignore[arg-type]
+@pytest.mark.parametrize("shape", [(3,), (2, 3, 3)])
+def test_hot_pixels_need_one_frame(shape: tuple[int, ...]) -> None:
+    with pytest.raises(fs.InputError, match="frame"):
+        find_hot_pixels(np.zeros(shape))
 
 
 SIDE = 160
