@@ -6,14 +6,12 @@ import os
 import pickle
 import subprocess
 import sys
-import tempfile
 import threading
 import weakref
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +22,6 @@ from faintspot.loop.control.flattening import phase_of_commands
 from faintspot.loop.control.identification.layers import AVERAGED, Identification, Identified
 from faintspot.loop.control.identification.loop_delay import LoopDelay
 from faintspot.loop.control.identification.model import Kalman
-from faintspot.loop.control.identification.recording import Recording
 from faintspot.loop.control.integrator import LoopPlant
 from faintspot.loop.control.reconstructor import make_reconstructor
 from faintspot.loop.slope_covariance import SlopeTurbulence
@@ -217,6 +214,10 @@ FRAMES = 2000
 """Frames that are kept, of large sensors fewer."""
 _MOST_BYTES = 64 << 20
 _LOWER_PRIORITY = 10  # above that of this process
+_CALL = (
+    "import pickle, sys; result, sys.stdout = sys.stdout.buffer, sys.stderr; "
+    "function, arguments = pickle.load(sys.stdin.buffer); pickle.dump(function(*arguments), result)"
+)
 
 Result = TypeVar("Result")
 
@@ -256,46 +257,39 @@ class RecentFrames:
 
 
 class BesideTheLoop(Generic[Result]):
-    """Work of another process of lower priority, for which a thread waits.
+    """Call of a function by another process of lower priority, for which a thread waits.
 
     Parameters
     ----------
-    code : str
-        Python code of the process; its argument is a folder.
-    write : callable
-        Write the process's input to the folder.
-    read : callable
-        Read what the process has written.
+    function : callable
+    *arguments
+        Its arguments. These, the function and its result can be pickled.
     """
 
-    def __init__(self, code: str, write: Callable[[Path], None], read: Callable[[Path], Result]) -> None:
-        self._work, self._result = (code, write, read), list[Result]()
-        self._child: subprocess.Popen[bytes] | None = None
+    def __init__(self, function: Callable[..., Result], *arguments: object) -> None:
+        self._call, self._result = (function, arguments), list[Result]()
         self._thread = threading.Thread(target=self._run, daemon=True)
         self._thread.start()
 
     def _run(self) -> None:
         with contextlib.suppress(OSError, EOFError, pickle.UnpicklingError):  # then there is no result
-            self._work_in_process()
+            self._call_in_process()
 
-    def _work_in_process(self) -> None:
-        code, write, read = self._work
-        with tempfile.TemporaryDirectory(prefix="faintspot-learning-") as name:
-            folder = Path(name)
-            write(folder)
-            self._child = subprocess.Popen(
-                [sys.executable, "-c", code, name],
-                stdout=subprocess.DEVNULL,
-                stderr=subprocess.DEVNULL,
-                env=os.environ | {"OPENBLAS_NUM_THREADS": "1"},
-            )
-            end = weakref.finalize(self, self._child.kill)
-            with contextlib.suppress(OSError, AttributeError):  # the process has ended, or Windows
-                priority = min(os.getpriority(os.PRIO_PROCESS, 0) + _LOWER_PRIORITY, 19)
-                os.setpriority(os.PRIO_PROCESS, self._child.pid, priority)
-            self._child.wait()
-            end.detach()
-            self._result.append(read(folder))
+    def _call_in_process(self) -> None:
+        child = subprocess.Popen(
+            [sys.executable, "-c", _CALL],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            env=os.environ | {"OPENBLAS_NUM_THREADS": "1"},
+        )
+        end = weakref.finalize(self, child.kill)
+        with contextlib.suppress(OSError, AttributeError):  # the process has ended, or Windows
+            priority = min(os.getpriority(os.PRIO_PROCESS, 0) + _LOWER_PRIORITY, 19)
+            os.setpriority(os.PRIO_PROCESS, child.pid, priority)
+        answer, _ = child.communicate(pickle.dumps(self._call))
+        end.detach()
+        self._result.append(pickle.loads(answer))
 
     @property
     def is_running(self) -> bool:
@@ -303,47 +297,9 @@ class BesideTheLoop(Generic[Result]):
         return self._thread.is_alive()
 
     def result(self) -> Result | None:
-        """Wait for the end, and return what was read; None if the work failed."""
+        """Wait for the end, and return the function's result; None if it failed."""
         self._thread.join()
         return self._result[0] if self._result else None
-
-
-_STORED = (
-    "interaction_matrix",
-    "cells",
-    "frame_rate_hz",
-    "subaperture_m",
-    "pixel_scale_arcsec",
-    "outer_scale_m",
-)
-STORED = tuple(f"recorded_{name}" for name in _STORED)
-"""Names in files of what is known of the recorded loop."""
-
-
-def stored(loop: Recording) -> dict[str, NDArray[Any]]:
-    """Return what is known of a recorded loop as arrays by name."""
-    values = {f"recorded_{name}": getattr(loop, name) for name in _STORED}
-    return {name: np.asarray(value) for name, value in values.items() if value is not None}
-
-
-def restored(arrays: Mapping[str, NDArray[Any]]) -> Recording | None:
-    """Return a recorded loop, of one frame of zeros, from arrays by name; None if there are none.
-
-    Raises
-    ------
-    InputError
-        When they do not fit together.
-    """
-    known: dict[str, Any] = {name: arrays.get(f"recorded_{name}") for name in _STORED}
-    matrix = known.pop("interaction_matrix")
-    if matrix is None:
-        return None
-    known = {
-        name: value.item() if np.ndim(value) == 0 and value is not None else value
-        for name, value in known.items()
-    }
-    slopes, commands = np.atleast_2d(matrix).shape
-    return Recording(np.zeros((1, slopes)), np.zeros((1, commands)), matrix, **known)
 
 
 def replayed_slopes(

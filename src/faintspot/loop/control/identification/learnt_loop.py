@@ -125,19 +125,9 @@ def _with_winds(observed: ObservedLoop, start: Identified | None) -> tuple[LoopO
     """Learn the filter of winds, for the interaction matrix as given."""
     ready, delay, seen = observed.ready, observed.delay, observed.seen
     loop, site = ready.recording, site_of_loop(ready.recording)
-    described = LoopOfControl(
-        loop.interaction_matrix,
-        np.where(np.isfinite(loop.slopes).any(axis=0), np.sqrt(seen.variance), np.inf),
-        1 / (loop.unit * delay.gains(len(loop.cells))),
-        ready.sign,
-        delay.row(),
-        np.zeros((0, 6)),
-        math.inf,
-        math.nan,
-        ready.sent_after_frames,
-        length_unit=site.length_unit,
-        recorded=loop.part(slice(0, 1)).scaled(1 / loop.unit),
-    )
+    gains, unit = delay.gains(len(loop.cells)), site.length_unit
+    error = np.sqrt(seen.variance)
+    described = LoopOfControl.of(ready, delay, loop.interaction_matrix, error, gains, length_unit=unit)
     learnt = learn_controller(
         described.plant(),
         seen.telemetry,

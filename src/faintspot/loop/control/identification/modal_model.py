@@ -3,12 +3,14 @@
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import Self
+from pathlib import Path
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.errors import InputError
+from faintspot.base.files import read_arrays
 from faintspot.loop.control.base import OpenLoopTelemetry
 from faintspot.loop.control.identification.layers import Identification
 from faintspot.loop.control.identification.learning import GAINS, JUDGED_PART, replayed_part
@@ -35,6 +37,15 @@ from faintspot.loop.control.reconstructor import make_reconstructor
 Floats = NDArray[np.float64]
 
 _LEAK = 0.01
+_RECORDED = (
+    "interaction_matrix",
+    "cells",
+    "frame_rate_hz",
+    "subaperture_m",
+    "pixel_scale_arcsec",
+    "outer_scale_m",
+)
+"""Fields of the recorded loop in files."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,6 +77,74 @@ class LoopOfControl:
     """(modes, m): matrix from such slopes to modes, of which `interaction` then has a row each; or empty."""
     recorded: Recording | None = None
     """A frame of the recorded loop, in the user's units: what learning again must know."""
+
+    @classmethod
+    def of(
+        cls,
+        ready: Prepared,
+        delay: LoopDelay,
+        matrix: Floats,
+        error: Floats | float,
+        gains: Floats,
+        **options: Any,
+    ) -> Self:
+        """Return the loop of a recording, without winds, gain and stroke limit.
+
+        Parameters
+        ----------
+        ready : Prepared
+        delay : LoopDelay
+        matrix, error : arrays
+            `interaction` and `standard_error`.
+        gains : (m,) array
+            Centroid gain of each slope.
+        options
+            Other fields.
+        """
+        loop = ready.recording
+        return cls(
+            matrix,
+            np.where(np.isfinite(loop.slopes).any(axis=0), error, np.inf),
+            1 / (loop.unit * gains),
+            ready.sign,
+            delay.row(),
+            np.zeros((0, 6)),
+            math.inf,
+            math.nan,
+            ready.sent_after_frames,
+            recorded=loop.part(slice(0, 1)).scaled(1 / loop.unit),
+            **options,
+        )
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """Return the loop as arrays by their names in files, see `read`."""
+        values = {f"loop_{name}": value for name, value in vars(self).items() if name != "recorded"}
+        if self.recorded is not None:
+            values |= {f"recorded_{name}": getattr(self.recorded, name) for name in _RECORDED}
+        return {name: np.asarray(value) for name, value in values.items() if value is not None}
+
+    @classmethod
+    def read(cls, path: str | Path, contents: str) -> Self:
+        """Read the loop from the file of a controller; the recorded loop has a frame of zeros.
+
+        Raises
+        ------
+        InputError
+            When it cannot be read; it names the contents.
+        """
+        own = tuple(f"loop_{name}" for name in cls.__dataclass_fields__ if name != "recorded")
+        optional = tuple(f"recorded_{name}" for name in _RECORDED)
+        arrays = read_arrays(path, contents, (*own, *optional), optional=optional)
+        values: dict[str, Any] = {
+            name: array.item() if array.ndim == 0 else array for name, array in arrays.items()
+        }
+        loop = cls(**{name.removeprefix("loop_"): values[name] for name in own})
+        known: dict[str, Any] = {name: values.get(f"recorded_{name}") for name in _RECORDED}
+        if known["interaction_matrix"] is None:
+            return loop
+        slopes, commands = np.atleast_2d(known["interaction_matrix"]).shape
+        frame: dict[str, Any] = {"slopes": np.zeros((1, slopes)), "commands": np.zeros((1, commands))}
+        return replace(loop, recorded=Recording(**frame, **known))
 
     @property
     def slopes_of_commands(self) -> Floats:
@@ -110,19 +189,14 @@ class LoopInModes:
             gains = delay.gains(len(loop.cells))
         modes = modes_of(replace(loop, slopes=loop.slopes / gains))
         in_modes, sent, run = of_modes(modes.recording)
-        described = LoopOfControl(
+        described = LoopOfControl.of(
+            ready,
+            delay,
             modes.recording.interaction_matrix,
-            np.where(np.isfinite(loop.slopes).any(axis=0), 1.0, np.inf),
-            1 / (loop.unit * gains),
-            ready.sign,
-            delay.row(),
-            np.zeros((0, 6)),
-            math.inf,
-            math.nan,
-            ready.sent_after_frames,
+            1.0,
+            gains,
             law=law_of(delay.gain * in_modes, sent, run),
             analysis=modes.analysis,
-            recorded=loop.part(slice(0, 1)).scaled(1 / loop.unit),
         )
         return cls(described, open_loop_of(modes.recording, replace(delay, gain=1.0)), loop.frame_rate_hz)
 
@@ -133,10 +207,8 @@ _ORDERS = (4, 8, 12, 20, 30, 50, 80, 120, 200)
 _FRAMES_FOR_ORDER = 80  # frames of a recording for each coefficient
 _SPECTRUM_FOR_ORDER = 5  # frames of a piece of the spectrum for each coefficient
 _BLOCKS, _MOST_COMPARED = 4, 100  # of frames left out, and modes, by which orders are compared
-_FEWEST_COUPLED, _MOST_SOURCES = (
-    8,
-    60,
-)  # modes: fewer are independent; by the past of so many all are predicted
+_FEWEST_COUPLED, _MOST_SOURCES = 8, 60
+"""Modes: fewer are independent; by the past of so many all are predicted."""
 _UNCERTAIN = 0.1  # of the variance of residual modes: gains differ by so much between modes and with time
 _RIDGES = (0.1, 0.3, 1.0, 3.0, 10.0)  # of the mean square of the past
 

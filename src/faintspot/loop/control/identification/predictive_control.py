@@ -2,32 +2,24 @@
 
 from __future__ import annotations
 
-import pickle
-from collections.abc import Mapping
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from faintspot.base.checks import one_of, real_array
 from faintspot.base.errors import InputError
-from faintspot.base.files import read_arrays
 from faintspot.loop.control.base import SETTLE_FRAMES, CommandDelayLine
 from faintspot.loop.control.identification.layers import Identified
 from faintspot.loop.control.identification.learning import (
     FRAMES,
     JUDGED_PART,
     STANDARD_ERRORS,
-    STORED,
     BesideTheLoop,
     RecentFrames,
     error_of_mean,
     replayed_slopes,
-    restored,
-    stored,
 )
 from faintspot.loop.control.identification.learnt_loop import (
     ObservedLoop,
@@ -52,11 +44,6 @@ _CONTENTS = "a predictive controller"
 _RELEARNT_FROM = 750  # frames since the integrator took over, from which is learnt in the background
 _PLAIN_AT_FIRST = 200  # frames in which it may drive because the filter has just begun
 _RELEARNT_EVERY = 5000  # frames, while the filter drives
-_LEARN_BESIDE = (
-    "import sys; from faintspot.loop.control.identification.predictive_control import learn_beside; "
-    "learn_beside(sys.argv[1])"
-)
-_TASK, _RESULT = "task.pickle", "result.pickle"  # kept with the covariances, which take long to compute
 
 
 class PredictiveControl:
@@ -224,8 +211,18 @@ class PredictiveControl:
             return
         frames = self._since_loss or self._waited
         if self._since_loss >= _RELEARNT_FROM or self._waited >= _RELEARNT_EVERY:
-            task = partial(_write_task, self._loop, self.model, *self._latest(frames))
-            self._beside = BesideTheLoop(_LEARN_BESIDE, task, _read_result)
+            self._beside = BesideTheLoop(self._learnt_from, *self._latest(frames))
+
+    def _learnt_from(self, slopes: Singles, commands: Singles) -> tuple[PredictiveControl | None, str]:
+        """Return `better_of` frames of the running loop; none if nothing can be learnt from them."""
+        try:
+            return self.better_of(self.recording_of(slopes, commands))
+        except InputError as error:
+            return None, f"not learnt again: {error}"
+
+    def __reduce__(self) -> tuple[type[PredictiveControl], tuple[LoopOfControl, Kalman]]:
+        """Return how to make it in another process, without its memory of frames."""
+        return PredictiveControl, (self._loop, self.model)
 
     def _latest(self, frames: int) -> tuple[Singles, Singles]:
         """Return slopes and commands of the latest frames, in the user's units; NaN where not measured."""
@@ -340,9 +337,8 @@ class PredictiveControl:
         if recording.sent_after_frames is None:
             recording = replace(recording, sent_after_frames=self._loop.sent_after_frames)
         again = learn(recording, self.model.identified)
-        latest = self._loop.sign * self._line.latest
-        self._loop, self._plant, self.model = again._loop, again._plant, again.model
-        self.reset(latest)
+        self._take(again)
+        self._eased = again._eased
         return self
 
     def save(self, path: str | Path) -> None:
@@ -353,11 +349,7 @@ class PredictiveControl:
         InputError
             When it cannot be written.
         """
-        loop = self._loop
-        known = {
-            f"loop_{name}": np.asarray(value) for name, value in vars(loop).items() if name != "recorded"
-        }
-        self.model.save(path, known | ({} if loop.recorded is None else stored(loop.recorded)))
+        self.model.save(path, self._loop.arrays())
 
     @classmethod
     def load(cls, path: str | Path) -> PredictiveControl:
@@ -368,13 +360,8 @@ class PredictiveControl:
         InputError
             When the file cannot be read, or has numbers out of range.
         """
-        names = [name for name in LoopOfControl.__dataclass_fields__ if name != "recorded"]
-        wanted = *(f"loop_{name}" for name in names), *STORED
-        arrays = read_arrays(path, _CONTENTS, wanted, optional=STORED)
-        values: Mapping[str, Any] = {name: arrays[f"loop_{name}"] for name in names}
         try:
-            plain = {name: array.item() if array.ndim == 0 else array for name, array in values.items()}
-            loop = LoopOfControl(**plain, recorded=restored(arrays))
+            loop = LoopOfControl.read(path, _CONTENTS)
             return cls(loop, Kalman.load(path, loop.plant()))
         except (ValueError, TypeError, IndexError):
             raise InputError(f"{path}: expected {_CONTENTS}, got arrays of another shape") from None
@@ -417,27 +404,6 @@ class PredictiveControl:
             f"{kind} {', '.join(map(str, self.left_out))} left out" if len(self.left_out) else "",
         ]
         return "; ".join(part for part in parts if part)
-
-
-def _write_task(loop: LoopOfControl, model: Kalman, slopes: Singles, commands: Singles, folder: Path) -> None:
-    (folder / _TASK).write_bytes(pickle.dumps((loop, model, slopes, commands)))
-
-
-def learn_beside(folder: str) -> None:
-    """Learn again from the frames in a private folder, and write the result to it."""
-    loop, model, slopes, commands = pickle.loads((Path(folder) / _TASK).read_bytes())
-    control = PredictiveControl(loop, model)
-    try:
-        better, text = control.better_of(control.recording_of(slopes, commands))
-    except InputError as error:
-        better, text = None, f"not learnt again: {error}"
-    learnt = None if better is None else (better._loop, better.model)
-    (Path(folder) / _RESULT).write_bytes(pickle.dumps((learnt, text)))
-
-
-def _read_result(folder: Path) -> tuple[PredictiveControl | None, str]:
-    learnt, text = pickle.loads((folder / _RESULT).read_bytes())
-    return (None if learnt is None else PredictiveControl(*learnt)), text
 
 
 def learn(recording: Recording, start: Identified | None = None) -> PredictiveControl:

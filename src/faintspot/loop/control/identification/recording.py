@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import KW_ONLY, dataclass, replace
 from typing import Any, NamedTuple
 
@@ -37,29 +38,21 @@ _BROKEN = 1e6  # rms of a slope relative to the median one
 _LARGEST = 1e30  # whose square is a number
 
 
-def _positive(meaning: str, unit: str, low: float, high: float) -> Option:
-    return Option(meaning, unit, low, high, per_subaperture=False, optional=True)
+def _number(meaning: str, unit: str, low: float, high: float, *, whole: bool = False) -> Option:
+    return Option(meaning, unit, low, high, whole=whole, per_subaperture=False, optional=True)
 
 
 NUMBERS = {
-    "frame_rate_hz": _positive("Frame rate.", "Hz", 1e-3, 1e6),
-    "subaperture_m": _positive("Side of a sub-aperture.", "m", 1e-3, 100.0),
-    "diameter_m": _positive("Diameter of the pupil.", "m", 1e-4, 1000.0),
-    "pixel_scale_arcsec": _positive("Angle of one unit of the slopes.", "arcsec", 1e-9, 1e9),
-    "delay_frames": _positive("Delay of the loop.", "frames", 1e-3, 100.0),
-    "largest_command": _positive("Limit of a command.", "", 1e-30, 1e30),
-    "gain_error": _positive("Relative error of the centroid gain of an open loop.", "", 1e-6, 10.0),
-    "outer_scale_m": _positive("Outer scale of the turbulence.", "m", 1e-2, 1e6),
-    "science_wavelength_m": _positive("Wavelength of the Strehl ratio.", "m", 1e-8, 1e-3),
-    "sent_after_frames": Option(
-        "Frames from a command's slopes to its row.",
-        "",
-        0,
-        100,
-        whole=True,
-        per_subaperture=False,
-        optional=True,
-    ),
+    "frame_rate_hz": _number("Frame rate.", "Hz", 1e-3, 1e6),
+    "subaperture_m": _number("Side of a sub-aperture.", "m", 1e-3, 100.0),
+    "diameter_m": _number("Diameter of the pupil.", "m", 1e-4, 1000.0),
+    "pixel_scale_arcsec": _number("Angle of one unit of the slopes.", "arcsec", 1e-9, 1e9),
+    "delay_frames": _number("Delay of the loop.", "frames", 1e-3, 100.0),
+    "largest_command": _number("Limit of a command.", "", 1e-30, 1e30),
+    "gain_error": _number("Relative error of the centroid gain of an open loop.", "", 1e-6, 10.0),
+    "outer_scale_m": _number("Outer scale of the turbulence.", "m", 1e-2, 1e6),
+    "science_wavelength_m": _number("Wavelength of the Strehl ratio.", "m", 1e-8, 1e-3),
+    "sent_after_frames": _number("Frames from a command's slopes to its row.", "", 0, 100, whole=True),
 }
 """Numbers that describe a recording, by name."""
 
@@ -173,9 +166,8 @@ class Recording:
                 raise InputError(f"{name}: expected shape {shape}, got {getattr(self, name).shape}")
         if self.commands is None or self.interaction_matrix is None:
             return
-        expected = self.slopes.shape[1], self.commands.shape[1]
-        if self.interaction_matrix.shape != expected:
-            shape = self.interaction_matrix.shape
+        expected, shape = (slopes, self.commands.shape[1]), self.interaction_matrix.shape
+        if shape != expected:
             raise InputError(f"interaction_matrix: expected shape {expected}, got {shape}")
 
     def part(self, rows: slice | NDArray[np.bool_]) -> Recording:
@@ -185,13 +177,7 @@ class Recording:
 
     def scaled(self, unit: float) -> Recording:
         """Return the same loop with slopes in another unit, so many of the present one."""
-        powers = {
-            "slopes": 1,
-            "interaction_matrix": 1,
-            "standard_errors": 1,
-            "covariance_xy": 2,
-            "prior_std": 1,
-        }
+        powers = {name: 1 for name in _ARRAYS if name != "commands"} | {"covariance_xy": 2}
         arrays = {name: getattr(self, name) for name in powers}
         scaled = {name: array / unit ** powers[name] for name, array in arrays.items() if array is not None}
         scale = self.pixel_scale_arcsec
@@ -277,9 +263,8 @@ def _without_unmeasured(recording: Recording) -> Recording:
     if matrix is not None:
         answers = matrix.any(axis=1).reshape(2, n)
         # A mirror may move one axis only.
-        reasons["rows of the interaction matrix are 0"] = (~answers & answers.any(axis=1)[:, None]).any(
-            axis=0
-        )
+        silent = ~answers & answers.any(axis=1)[:, None]
+        reasons["rows of the interaction matrix are 0"] = silent.any(axis=0)
     remarks = [f"{_named(mask, recording.cells)}: {why}" for why, mask in reasons.items() if mask.any()]
     for why in tuple(reasons)[3:]:
         slopes[:, np.tile(reasons[why], 2)] = np.nan
@@ -296,8 +281,7 @@ def _without_constant(recording: Recording) -> Recording:
         return recording
     slopes = recording.slopes.copy()
     slopes[:, constant] = np.nan
-    more = f" and {len(constant) - _NAMED} more" if len(constant) > _NAMED else ""
-    remark = f"slope {', '.join(map(str, constant[:_NAMED]))}{more}: constant, or never measured"
+    remark = f"slope {_first_ones(constant)}: constant, or never measured"
     return replace(recording, slopes=slopes, remarks=(*recording.remarks, remark))
 
 
@@ -318,9 +302,13 @@ def _without_still_actuators(loop: Recording) -> Recording:
 def _named(mask: NDArray[np.bool_], cells: NDArray[np.int64]) -> str:
     """Return sub-apertures with row and column as text."""
     numbers = np.flatnonzero(mask)
-    shown = ", ".join(f"{k} (row {cells[k][0]}, column {cells[k][1]})" for k in numbers[:_NAMED])
-    more = f" and {len(numbers) - _NAMED} more" if len(numbers) > _NAMED else ""
-    return f"sub-aperture{'s' if len(numbers) > 1 else ''} {shown}{more}"
+    named = [f"{k} (row {cells[k][0]}, column {cells[k][1]})" for k in numbers]
+    return f"sub-aperture{'s' if len(numbers) > 1 else ''} {_first_ones(named)}"
+
+
+def _first_ones(values: Sequence[object] | NDArray[np.int64]) -> str:
+    more = f" and {len(values) - _NAMED} more" if len(values) > _NAMED else ""
+    return f"{', '.join(map(str, values[:_NAMED]))}{more}"
 
 
 def _with_convention(loop: Recording) -> Prepared:

@@ -372,9 +372,8 @@ class LargeGuarded(GuardedController):
         """Compute the slopes that commands cause and, if the latest are new, the prediction."""
         lines, mirror = self._lines, self.line
         commands = [line.latest for line in lines] if is_new else []
-        followed = next(
-            (k for k, line in enumerate(lines) if np.array_equal(line.acting, mirror.acting)), None
-        )
+        equal = (k for k, line in enumerate(lines) if np.array_equal(line.acting, mirror.acting))
+        followed = next(equal, None)
         if followed is None:
             commands.append(mirror.acting)
         new_slopes = self._product.several(*commands) if commands else np.zeros((0, 0))
@@ -391,11 +390,9 @@ class LargeGuarded(GuardedController):
 
     def _of_latest(self, line: int) -> Floats:
         """Return the slopes that the latest command of a line causes."""
-        slopes: Floats = self._caused[line, self._lines[line].next_row - 1]
-        return slopes
+        return np.asarray(self._caused[line, self._lines[line].next_row - 1])
 
     def _of_acting(self, line: int) -> Floats:
         """Return the slopes that the command of a line that acts in this frame causes."""
         rows = self._caused[line]
-        slopes: Floats = rows[(self._lines[line].next_row + 1) % len(rows)]
-        return slopes
+        return np.asarray(rows[(self._lines[line].next_row + 1) % len(rows)])
