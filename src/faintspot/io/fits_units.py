@@ -276,6 +276,8 @@ def columns_of(unit: HeaderDataUnit) -> dict[str, Column]:
     header, columns = unit.header, {}
     row_bytes, count = int(header["NAXIS1"]), int(header["NAXIS2"])
     check_bytes(unit.name, row_bytes, MOST_WHOLE_BYTES, "a row")
+    if f"TFORM{header['TFIELDS']}" not in header:  # astropy would look for each of them
+        raise ValueError(f"TFORM{header['TFIELDS']} is missing")
     table = load_package("astropy.io.fits").BinTableHDU.fromstring(header.tostring().encode())
     stored = table.columns.dtype.newbyteorder(">")
     if stored.itemsize != row_bytes:

@@ -153,6 +153,7 @@ def test_columns_of_a_table(tmp_path: Path, ending: str) -> None:
         ("NAXIS1", 7),
         ("NAXIS2", 2**40),
         ("TFIELDS", 3),
+        ("TFIELDS", 10**9),
         ("TSCAL4", "two"),
     ],
 )
