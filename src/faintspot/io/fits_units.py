@@ -234,6 +234,7 @@ def is_aot(path: str | Path) -> bool:
         return False
 
 
+_MOST_COLUMNS = 999  # by the FITS standard
 _NUMBERS = "BIJKED"
 """Letters of the formats of columns of numbers."""
 
@@ -276,9 +277,13 @@ def columns_of(unit: HeaderDataUnit) -> dict[str, Column]:
     header, columns = unit.header, {}
     row_bytes, count = int(header["NAXIS1"]), int(header["NAXIS2"])
     check_bytes(unit.name, row_bytes, MOST_WHOLE_BYTES, "a row")
-    if f"TFORM{header['TFIELDS']}" not in header:  # astropy would look for each of them
-        raise ValueError(f"TFORM{header['TFIELDS']} is missing")
-    table = load_package("astropy.io.fits").BinTableHDU.fromstring(header.tostring().encode())
+    n_columns = int(header["TFIELDS"])
+    if n_columns > _MOST_COLUMNS:
+        raise ValueError(f"it has {n_columns} columns")
+    numbered = header.copy()  # names may be missing, or occur twice
+    for number in range(1, n_columns + 1):
+        numbered[f"TTYPE{number}"] = f"COLUMN{number}"
+    table = load_package("astropy.io.fits").BinTableHDU.fromstring(numbered.tostring().encode())
     stored = table.columns.dtype.newbyteorder(">")
     if stored.itemsize != row_bytes:
         raise ValueError(f"its columns have {stored.itemsize} bytes, NAXIS1 says {row_bytes}")
@@ -289,7 +294,8 @@ def columns_of(unit: HeaderDataUnit) -> dict[str, Column]:
         row: Any = {"names": ["values"], "formats": [kind], "offsets": [offset], "itemsize": row_bytes}
         keys = {"BSCALE": "TSCAL", "BZERO": "TZERO", "BLANK": "TNULL"}
         cards = {key: header[f"{own}{number}"] for key, own in keys.items() if f"{own}{number}" in header}
-        columns[column.name] = Column(column.name, np.dtype(row), count, cards)
+        name = str(header.get(f"TTYPE{number}", column.name)).strip()
+        columns[name] = Column(name, np.dtype(row), count, cards)
     return columns
 
 

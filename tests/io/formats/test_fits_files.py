@@ -143,6 +143,13 @@ def test_columns_of_a_table(tmp_path: Path, ending: str) -> None:
             read_array(f"{path}{key}")
 
 
+def test_two_columns_of_one_name(tmp_path: Path) -> None:
+    path = tmp_path / "loop.fits"
+    expected = table(path)["Level"]
+    path.write_bytes(path.read_bytes().replace(b"'Text    '", b"'Level   '"))
+    np.testing.assert_array_equal(read_array(f"{path}:Level"), expected)
+
+
 @pytest.mark.parametrize(
     ("card", "value"),
     [
