@@ -242,24 +242,10 @@ def tv_denoise(
     counts = np.empty((3, len(flat)), np.int64)
     lanes = lanes_for(flat.dtype)
     begin = flat_start_table(ny, nx, flat.dtype)
+    window, how, found = (ny, nx), ALGORITHMS[algorithm], (denoised, multiplier, counts)
 
     def job(start: int, stop: int, scratch: tuple[object, ...]) -> None:
-        denoise_stack(
-            lanes,
-            flat,
-            ny,
-            nx,
-            settings,
-            ALGORITHMS[algorithm],
-            lower_strength,
-            begin,
-            start,
-            stop,
-            scratch,
-            denoised,
-            multiplier,
-            counts,
-        )
+        denoise_stack(lanes, flat, window, settings, how, lower_strength, begin, start, stop, scratch, found)
 
     run_groups(job, -(-len(flat) // lanes.width), lanes, (ny, nx))
     result = denoised.reshape(stack.shape)

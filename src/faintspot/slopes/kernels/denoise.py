@@ -244,18 +244,7 @@ def _mark_finished(width: Any, iteration: Any, tested: Any, lane_values: Any, co
 
 @compiled
 def denoise_group(
-    lanes: Any,
-    algorithm: Any,
-    lowers: Any,
-    table: Any,
-    ny: Any,
-    nx: Any,
-    image: Any,
-    output: Any,
-    state: Any,
-    rows: Any,
-    lane_values: Any,
-    counts: Any,
+    lanes: Any, algorithm: Any, lowers: Any, table: Any, window: Any, image: Any, output: Any, own: Any
 ) -> None:
     """Denoise the W images of a group.
 
@@ -268,16 +257,14 @@ def denoise_group(
         Whether a strength above HIGHEST_STRENGTH is lowered, as indicated by INFEASIBLE.
     table : array
         From `flat_start_table`.
-    ny, nx : int
+    window : (ny, nx)
     image, output : (ny * nx * W,) arrays
         Input, which is not modified, and result: all lanes of a pixel side by side.
-    state, rows : arrays
-        Scratch of STATE_VECTORS * ny * nx * W and `row_vectors(ny, nx)` * W numbers.
-    lane_values : (LANE_ROWS * W,) array
-        STRENGTH and TOLERANCE are read, MULTIPLIER is written, the rest is scratch.
-    counts : (COUNT_ROWS * W,) int64 array
-        LIMIT is read; ITERATIONS, CONVERGED, INFEASIBLE are written.
+    own : GravityScratch
+        STRENGTH, TOLERANCE and LIMIT are read; MULTIPLIER, ITERATIONS, CONVERGED and INFEASIBLE are written.
     """
+    ny, nx = window
+    state, rows, lane_values, counts = own.state, own.rows, own.denoiser, own.counts
     width = width_of(lanes)
     # Strengths below the images' rounding error count as zero; ranges whose inverse overflows, as constant.
     smallest, smallest_range = (1e-8, 1e-30) if image.itemsize == 4 else (1e-17, 1e-290)

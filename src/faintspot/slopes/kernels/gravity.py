@@ -56,9 +56,13 @@ class GravityScratch(NamedTuple):
     """Memory of one thread: of the denoiser, and the lanes' values of denoiser and centroid."""
 
     state: Any
+    """(STATE_VECTORS * pixels * W,)."""
     rows: Any
+    """(`row_vectors` * W,)."""
     denoiser: Any
+    """(denoise.LANE_ROWS * W,)."""
     counts: Any
+    """(denoise.COUNT_ROWS * W,) int64."""
     centroid: Any
 
 
@@ -106,20 +110,8 @@ def _first_step(
     """Denoise or smooth the images where there are tables for it; return where the result is."""
     lanes, ny, nx = group.lanes, group.ny, group.nx
     if flat_start is not None:
-        denoise_group(
-            lanes,
-            algorithm,
-            True,  # strengths are lowered
-            flat_start,
-            ny,
-            nx,
-            image,
-            output,
-            own.state,
-            own.rows,
-            own.denoiser,
-            own.counts,
-        )
+        lowers = True
+        denoise_group(lanes, algorithm, lowers, flat_start, (ny, nx), image, output, own)
         return output
     if taps is not None:
         gather_taps(width_of(lanes), group.first, taps, own.rows)
@@ -185,8 +177,7 @@ gravity_of_groups = driver_of(locate_gravity)
 def denoise_stack(
     lanes: Any,
     images: Any,
-    ny: Any,
-    nx: Any,
+    window: Any,
     settings: Any,
     algorithm: Any,
     lowers: Any,
@@ -194,14 +185,14 @@ def denoise_stack(
     start: Any,
     stop: Any,
     scratch: Any,
-    denoised: Any,
-    multiplier: Any,
-    counts_out: Any,
+    found: Any,
 ) -> None:
-    """Denoise the groups [start, stop) of a stack of images (n, pixels).
+    """Denoise the groups [start, stop) of a stack of images (n, pixels) of a window (ny, nx).
 
-    `settings` is (3, n): strength, tolerance, limit; `counts_out` (3, n): iterations, converged, infeasible.
+    `settings` is (3, n): strength, tolerance, limit. `found` are the denoised images, the multipliers (n,),
+    and counts (3, n): iterations, converged, infeasible.
     """
+    denoised, multiplier, counts_out = found
     width = width_of(lanes)
     image, output, own = scratch.image, scratch.spare, scratch.own
     denoiser, counts = own.denoiser, own.counts
@@ -214,9 +205,7 @@ def denoise_stack(
             denoiser[total_variation.STRENGTH * width + lane] = settings[0, s]
             denoiser[total_variation.TOLERANCE * width + lane] = settings[1, s]
             counts[total_variation.LIMIT * width + lane] = int(settings[2, s])
-        denoise_group(
-            lanes, algorithm, lowers, table, ny, nx, image, output, own.state, own.rows, denoiser, counts
-        )
+        denoise_group(lanes, algorithm, lowers, table, window, image, output, own)
         scatter_images(width, output, first, denoised)
         for lane in range(min(width, n - first)):
             s = first + lane
