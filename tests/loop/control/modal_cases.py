@@ -1,5 +1,8 @@
 """Simulated loops of sensors without geometry."""
 
+from collections.abc import Mapping
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 from tests.loop.control.driven import driven, oscillator
@@ -64,3 +67,18 @@ def recorded(slopes: Floats, commands: Floats, matrix: Floats | None = None) -> 
     """Return a recording without geometry."""
     matrix = np.eye(slopes.shape[1]) if matrix is None else matrix
     return Recording(slopes, commands, matrix, None, RATE_HZ)
+
+
+def commands_of_matrices(file: Mapping[str, Any], slopes: Floats) -> Floats:
+    """Return the commands (frames, commands) that exported matrices make of slopes, (frames, m)."""
+    state, sent = np.zeros(len(file["state_of_state"])), []
+    held = np.zeros((int(file["delay_frames"]), len(file["command_of_state"])))
+    for row in slopes:
+        inputs = {"state": state, "slopes": row, "mirror": held[0]}
+        command, state = (
+            sum(file[f"{name}_of_{key}"] @ values for key, values in inputs.items())
+            for name in ("command", "state")
+        )
+        held = np.vstack([held[1:], command])
+        sent.append(command)
+    return np.array(sent)

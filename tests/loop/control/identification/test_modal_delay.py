@@ -5,7 +5,6 @@ import pytest
 from scipy.signal import lfilter
 from tests.loop.control.modal_cases import integrated, wandering
 
-from faintspot.base.errors import InputError
 from faintspot.loop.control.identification.modal_delay import (
     FILTERED,
     INTEGRATOR,
@@ -48,11 +47,11 @@ def test_gain_of_a_bright_sensor_that_sees_fine_turbulence() -> None:
 
 
 def test_a_gain_with_which_the_recorded_loop_was_not_stable_is_none() -> None:
-    """The stable limit of a delay of 2 frames is 1."""
+    """The stable limit of a delay of 2 frames is 1; the spectra alone say 1.09, as the loop grows slowly."""
     rng = np.random.default_rng(13)
-    slopes, commands = integrated(wandering(rng, FRAMES), rng, gain=0.8, loop_gain=1.1)
-    found = ModalFits(slopes, commands, RUN).of(2.0)
-    assert 0.5 < found.gain < 1 / 1.1
+    slopes, commands = integrated(wandering(rng, 400), rng, gain=0.8, loop_gain=1.3)
+    found = ModalFits(slopes, commands, RUN[:400]).of(2.0)
+    assert 0.8 < 1.3 * found.gain < 1.0
 
 
 def test_the_law_is_named() -> None:
@@ -62,8 +61,3 @@ def test_the_law_is_named() -> None:
     assert law_of(*plain, RUN) == f"{INTEGRATOR} of gain 0.4"
     assert law_of(*filtered, RUN) == FILTERED
     assert law_of(plain[0], rng.standard_normal(plain[1].shape), RUN) == OTHER
-
-
-def test_too_few_frames() -> None:
-    with pytest.raises(InputError, match="expected 326 consecutive frames, got 300"):
-        ModalFits(np.zeros((300, 2)), np.zeros((300, 2)), RUN[:300])

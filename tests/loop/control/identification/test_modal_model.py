@@ -6,7 +6,14 @@ from typing import Any
 import numpy as np
 import pytest
 from scipy.signal import lfilter
-from tests.loop.control.modal_cases import NOISE, Floats, integrated, recorded, wandering
+from tests.loop.control.modal_cases import (
+    NOISE,
+    Floats,
+    commands_of_matrices,
+    integrated,
+    recorded,
+    wandering,
+)
 
 from faintspot.base.errors import InputError
 from faintspot.loop.control.base import CommandDelayLine
@@ -93,14 +100,7 @@ def test_controller_from_a_file_does_the_same(tip_tilt: PredictiveControl, tmp_p
     tip_tilt.export(tmp_path / "matrices.npz")
     file, line = dict(np.load(tmp_path / "matrices.npz")), CommandDelayLine(2, DELAY)
     alone = tip_tilt.model.controller(tip_tilt._plant, line)
-    state, held = np.zeros(len(file["state_of_state"])), np.zeros((DELAY, 2))
-    for row in rows:
-        inputs = {"state": state, "slopes": row, "mirror": held[0]}
-        command, state = (
-            sum(file[f"{name}_of_{key}"] @ values for key, values in inputs.items())
-            for name in ("command", "state")
-        )
-        held = np.vstack([held[1:], command])
+    for row, command in zip(rows, commands_of_matrices(file, rows), strict=True):
         alone.update(*tip_tilt._controlled(tip_tilt._loop.scale * row, np.ones(2)))
         np.testing.assert_allclose(command, line.latest, atol=1e-9)
 
