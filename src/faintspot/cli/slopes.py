@@ -140,10 +140,11 @@ def describe(summary: Summary, output: str) -> list[str]:
     """Summarise the run and suggest the next command."""
     if summary.resumed_at == summary.n_frames:
         return [
-            f"{output}: complete already ({summary.n_frames} frames); --overwrite makes it anew",
+            f"{output}: complete already ({_count(summary.n_frames, 'frame')}); --overwrite makes it anew",
             *_next_step(output),
         ]
-    lines = [f"{output}: {summary.n_frames} frames, {summary.n_subapertures} sub-apertures"]
+    sizes = _count(summary.n_frames, "frame"), _count(summary.n_subapertures, "sub-aperture")
+    lines = [f"{output}: {', '.join(sizes)}"]
     if summary.resumed_at:
         lines.append(
             f"  went on at frame {summary.resumed_at} (counted from 0); the counts are from there on"
@@ -161,17 +162,23 @@ def describe(summary: Summary, output: str) -> list[str]:
     for flag, text in texts.items():
         count = summary.flag_counts.get(flag, 0)
         if count:
-            lines.append(f"  {count} slopes {text} ({100 * count / summary.measured:.3g} %)")
+            lines.append(f"  {_count(count, 'slope')} {text} ({100 * count / summary.measured:.3g} %)")
     if summary.repeated_frames:
-        lines.append(f"  {summary.repeated_frames} frames repeated: every pixel as in the one before")
+        lines.append(
+            f"  {_count(summary.repeated_frames, 'frame')} repeated: every pixel as in the one before"
+        )
     lines += [f"  {note}" for note in summary.notes]
     if not any(summary.flag_counts.values()) and not summary.doubtful:
         lines.append("  every slope is valid, without any flag")
     if summary.bad_frames:
-        lines.append(f"  {summary.bad_frames} frames without any valid slope")
+        lines.append(f"  {_count(summary.bad_frames, 'frame')} without any valid slope")
     return lines + _next_step(output)
 
 
 def _next_step(output: str) -> list[str]:
     """Return the next command; a .csv does not hold what a report needs."""
     return [] if Path(output).suffix.lower() == ".csv" else [f"Next: faintspot report {shlex.quote(output)}"]
+
+
+def _count(number: int, noun: str) -> str:
+    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
