@@ -343,9 +343,9 @@ def _limits(seen: FirstSettings) -> list[str]:
             f"the flux of single frames is too low for full slopes: they show {seen.response:.2f} of the "
             "displacements; `faintspot tune --recording` says what is possible"
         )
-    if math.isfinite(seen.systematic_px or math.inf):
+    if seen.systematic_px is not None and math.isfinite(seen.systematic_px):
         lines.append(
-            f"S-curve: systematic errors up to {seen.systematic_px:.3f} px wherever a spot of "
+            f"S-curve: systematic errors up to {max(seen.systematic_px, 0.001):.3f} px wherever a spot of "
             f"{seen.fwhm_px:.2g} px lies in its pixels, in simulations of Gaussian spots"
         )
     if seen.at_edge_px > _LARGE_PX:
