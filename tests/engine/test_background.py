@@ -178,7 +178,7 @@ def test_a_better_filter_is_handed_to_the_engine(
         assert not engine.learning["taken"]
         learning.close()
     run.ring.close()
-    assert learning.ended
+    assert learning._reader.stale
 
 
 @pytest.mark.slow

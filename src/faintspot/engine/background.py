@@ -1,11 +1,10 @@
-"""Processes of lowest priority beside a running engine: learning from its telemetry."""
+"""Learning from the telemetry of a running engine, in a process of lowest priority beside it."""
 
 import signal
 import tempfile
 import threading
 import time
-from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -28,131 +27,14 @@ from faintspot.loop.telemetry.recording import CLOSED, recorded_loop, site_of
 from faintspot.slopes.pipeline.configuration import Configuration
 from faintspot.slopes.pipeline.settings import Settings
 
+_LOOK_S = 0.5  # between two looks at the telemetry, of which the ring keeps some seconds
+_PATIENCE_S = 300.0  # processor time after which learning ends the process
 _WATCH_S = 1.0
-
-
-class BackgroundProcess(ABC):
-    """Reader of a running engine's telemetry that answers to it, in another process than the engine.
-
-    Parameters
-    ----------
-    name : str
-        Name of the engine.
-
-    Raises
-    ------
-    InputError
-        When there is no engine.
-    """
-
-    look_s: float
-    """Time between two looks at the telemetry."""
-    patience_s: float
-    """Processor time after which an answer ends the process."""
-    failed: str
-    """Words for what an answer could not do."""
-
-    def __init__(self, name: str) -> None:
-        self._path, self._reader = socket_path(name), TelemetryRing.attach(name)
-
-    def tell(self, command: str, models: Mapping[str, Any], **fields: object) -> dict[str, Any]:
-        """Send the engine a command, with a file of each model that is not None; return its answer.
-
-        Raises
-        ------
-        InputError
-            When the engine refuses it, or does not answer.
-        """
-        with tempfile.TemporaryDirectory(prefix="faintspot-models-") as folder:
-            files: dict[str, str | None] = {}
-            for name, model in models.items():
-                files[name] = None if model is None else f"{folder}/{name}.npz"
-                if model is not None:
-                    model.save(files[name])
-            return request(self._path, command, timeout_s=LENGTHY_TIMEOUT_S, **files, **fields)
-
-    def close(self) -> None:
-        """Close the telemetry."""
-        self._reader.close()
-
-    @property
-    def ended(self) -> bool:
-        """Whether the engine has ended."""
-        return self._reader.stale
-
-    @abstractmethod
-    def take(self) -> bool:
-        """Take the telemetry that has come; return whether it is enough for an answer."""
-
-    @abstractmethod
-    def answer(self) -> str | None:
-        """Answer to the engine; return a line about it, if there is something to say.
-
-        Raises
-        ------
-        InputError
-            When the telemetry tells nothing, or the engine refuses the answer.
-        """
-
-    def run(self, say: Callable[[str], None]) -> None:
-        """Answer at the lowest priority until the engine ends; `say` takes a line for each answer."""
-        lowest_priority()
-        try:
-            while not self.ended:
-                time.sleep(self.look_s)
-                if self.take():
-                    self._answer_in_time(say)
-        finally:
-            self.close()
-
-    def _answer_in_time(self, say: Callable[[str], None]) -> None:
-        signal.setitimer(signal.ITIMER_PROF, self.patience_s)  # processor time: it may wait for long
-        try:
-            line = self.answer()
-            if line is not None:
-                say(line)
-        except InputError as error:
-            say(f"{self.failed}: {error}")
-        finally:
-            signal.setitimer(signal.ITIMER_PROF, 0.0)
-
-
-@contextmanager
-def background_process(
-    command: str, arguments: Sequence[str], on_fault: Callable[[str], None]
-) -> Iterator[None]:
-    """Run `faintspot realtime COMMAND ARGUMENTS` within a context; `on_fault` takes a line if it ends."""
-    done = threading.Event()
-    with (
-        tempfile.TemporaryDirectory(prefix=f"faintspot-{command}-") as folder,
-        ChildProcesses(Path(folder)) as children,
-    ):
-        children.start(command, ["realtime", command, *arguments], ONE_THREAD)
-        watcher = threading.Thread(target=_watch, args=(children, done, on_fault), daemon=True)
-        watcher.start()
-        try:
-            yield
-        finally:
-            done.set()
-            watcher.join()
-
-
-def _watch(children: ChildProcesses, done: threading.Event, on_fault: Callable[[str], None]) -> None:
-    """Wait for the end of the process."""
-    while not done.wait(_WATCH_S):
-        try:
-            children.check()
-        except InputError as error:
-            if not done.wait(_WATCH_S):  # else the engine has ended, too
-                on_fault(f"{error}")
-            return
-
-
 _FROM_NOTHING_EVERY = 6  # learnings, as a search from known layers finds no new one
 
 
-class BackgroundLearning(BackgroundProcess):
-    """Learner of a running engine's Kalman filter, in another process than the engine.
+class BackgroundLearning:
+    """Learner of a running engine's Kalman filter from its telemetry, in another process than the engine.
 
     Parameters
     ----------
@@ -169,10 +51,6 @@ class BackgroundLearning(BackgroundProcess):
         When the configuration has no Kalman filter or no size of a sub-aperture, or there is no engine.
     """
 
-    look_s = 0.5  # the ring keeps some seconds
-    patience_s = 300.0
-    failed = "not learnt"
-
     def __init__(self, name: str, config: str | Path, every_s: float) -> None:
         described = Configuration(config)
         control = load_control(described)
@@ -180,7 +58,7 @@ class BackgroundLearning(BackgroundProcess):
             raise InputError(f'{config}: expected controller = "kalman" in [control], to learn it again')
         self._control: Control = control
         self._site, self._layout = site_of(described.layout), described.layout
-        super().__init__(name)
+        self._path, self._reader = socket_path(name), TelemetryRing.attach(name)
         self._every_s = every_s
         self._cursor, self._records = self._reader.records.written, list[NDArray[np.void]]()
         self._last: RelearntControl | None = None
@@ -211,10 +89,30 @@ class BackgroundLearning(BackgroundProcess):
         first, last = (self._records[end]["last_row_time_ns"][end] for end in (0, -1))
         return (int(last) - int(first)) / 1e9
 
-    def answer(self) -> str:
-        """See `BackgroundProcess`: learn, and offer the filter."""
-        relearnt, is_taken = self.learn()
-        return f"{relearnt.summary()}; {'taken' if is_taken else 'not taken'}"
+    def run(self, say: Callable[[str], None]) -> None:
+        """Learn at the lowest priority until the engine ends; `say` takes a line for each time."""
+        lowest_priority()
+        try:
+            while not self._reader.stale:
+                time.sleep(_LOOK_S)
+                if self.take():
+                    say(self._learnt_in_time())
+        finally:
+            self.close()
+
+    def close(self) -> None:
+        """Close the telemetry."""
+        self._reader.close()
+
+    def _learnt_in_time(self) -> str:
+        signal.setitimer(signal.ITIMER_PROF, _PATIENCE_S)  # processor time: it may wait for long
+        try:
+            relearnt, is_taken = self.learn()
+            return f"{relearnt.summary()}; {'taken' if is_taken else 'not taken'}"
+        except InputError as error:
+            return f"not learnt: {error}"
+        finally:
+            signal.setitimer(signal.ITIMER_PROF, 0.0)
 
     def learn(self) -> tuple[RelearntControl, bool]:
         """Learn from the records since the last time; return the result and whether the engine took it.
@@ -247,7 +145,12 @@ class BackgroundLearning(BackgroundProcess):
         )
         self._count += 1
         new = relearnt.learnt if relearnt.is_better else None
-        self.tell("learnt", {"model": new}, found=relearnt.summary())
+        with tempfile.TemporaryDirectory(prefix="faintspot-models-") as folder:
+            model = None if new is None else f"{folder}/model.npz"
+            if new is not None and model is not None:
+                new.save(model)
+            found = relearnt.summary()
+            request(self._path, "learnt", timeout_s=LENGTHY_TIMEOUT_S, model=model, found=found)
         if new is not None:
             self._control = self._control.with_model(new)
         return relearnt, relearnt.is_better
@@ -270,5 +173,27 @@ def background_learning(
         say(f"winds are not learnt again, the loop goes on: {text}")
 
     arguments = "--config", f"{config}", "--name", engine.name, "--every", f"{every_s:g}"
-    with background_process("learn", arguments, fault):
-        yield
+    done = threading.Event()
+    with (
+        tempfile.TemporaryDirectory(prefix="faintspot-learn-") as folder,
+        ChildProcesses(Path(folder)) as children,
+    ):
+        children.start("learn", ["realtime", "learn", *arguments], ONE_THREAD)
+        watcher = threading.Thread(target=_watch, args=(children, done, fault), daemon=True)
+        watcher.start()
+        try:
+            yield
+        finally:
+            done.set()
+            watcher.join()
+
+
+def _watch(children: ChildProcesses, done: threading.Event, on_fault: Callable[[str], None]) -> None:
+    """Wait for the end of the process."""
+    while not done.wait(_WATCH_S):
+        try:
+            children.check()
+        except InputError as error:
+            if not done.wait(_WATCH_S):  # else the engine has ended, too
+                on_fault(f"{error}")
+            return
