@@ -1,5 +1,7 @@
 """The pixel ring: between processes, nothing is torn, lost or mixed unseen; what is not a ring is refused."""
 
+from __future__ import annotations
+
 import multiprocessing
 import os
 import stat
