@@ -199,6 +199,8 @@ def test_page_of_a_night_lists_its_blocks(tmp_path: Path) -> None:
 def test_what_cannot_be_compared(tmp_path: Path) -> None:
     known = alternating(600)
     path = stored(tmp_path, known)
+    with refused("settle_frames = 0"):
+        recorded_night(path, settle_frames=0)
     with refused("night.zarr: none: 0 turns", "--every"):
         recorded_night(path, settle_frames=48)
     wrong_times = MeasuredStrehl(np.arange(9.0), np.full(9, 0.3), np.zeros(9))

@@ -6,7 +6,6 @@ import tomllib
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.base.errors import InputError
 from faintspot.base.report import page
 from faintspot.base.report.plots import Line, Panel
 from faintspot.base.report.texts import Texts, plain_number, with_error, with_interval
@@ -219,7 +218,7 @@ _LEARNING_LINE = (0, (6, 1.5, 1, 1.5))
 
 def loop_page(result: MagnitudeResult) -> page.Report:
     """Return the report page of closed-loop results."""
-    configuration = _configuration(result.configuration)
+    configuration = LoopConfiguration.of_results(result.configuration)
     wavelength_um = 1.65 if configuration is None else configuration.science.wavelength_m * 1e6
     name = "" if configuration is None else f": “{configuration.name}”"
     sections = [
@@ -290,14 +289,6 @@ def _style(name: str) -> dict[str, object]:
     filling = style.colour if name == base else "white"
     line = _LEARNING_LINE if split_control(name)[1] else style.line
     return {"color": style.colour, "marker": style.marker, "ms": 6, "mfc": filling, "lw": 1.5, "ls": line}
-
-
-def _configuration(text: str) -> LoopConfiguration | None:
-    """Return the configuration of a TOML text, or None when it is not known."""
-    try:
-        return LoopConfiguration.from_text(text) if text else None
-    except InputError:
-        return None
 
 
 def _facts(configuration: LoopConfiguration) -> dict[str, str]:

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.base.errors import InputError
 from faintspot.base.files import write_atomically
 from faintspot.base.report import page
 from faintspot.base.report.plots import FLUX_GREY, METHOD_COLOURS, WIDTH, Line, Panel
@@ -279,7 +278,7 @@ def night_sections(night: Night) -> list[page.Section]:
 
 def night_page(night: Night) -> page.Report:
     """Return the page of a night."""
-    configuration = _configuration(night)
+    configuration = LoopConfiguration.of_results(night.configuration)
     name = "" if configuration is None else f": “{configuration.name}”"
     sections = night_sections(night)
     if night.configuration:
@@ -353,13 +352,6 @@ def _quality_of_r0(night: Night) -> dict[str, Any]:
         return {"ratio": None}
     within = 100 * float(np.mean(np.abs(ratio - 1) < 0.1))
     return {"ratio": np.median(ratio), "within": within, "count": len(ratio)}
-
-
-def _configuration(night: Night) -> LoopConfiguration | None:
-    try:
-        return LoopConfiguration.from_text(night.configuration) if night.configuration else None
-    except InputError:
-        return None
 
 
 def _facts(night: Night) -> Mapping[str, str]:

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from faintspot.base.checks import number_between
 from faintspot.base.errors import InputError
 from faintspot.base.report.page import Report, Section
 from faintspot.base.report.texts import Texts
@@ -105,6 +106,8 @@ def recorded_night(
         When the loop was not closed with several methods, turns are too short, no exposure is within one, or
         control or sizes are not known.
     """
+    if settle_frames is not None:
+        settle_frames = int(number_between("settle_frames", settle_frames, 1, integer=True))
     telemetry = read_telemetry(path, images=False)
     try:
         control = control_of(telemetry.attributes, configuration)
@@ -163,7 +166,7 @@ def _night(
     source: str,
     wavelength_m: float,
 ) -> RecordedNight:
-    settle = [settle_frames or frames for frames in methods.settle_frames]
+    settle = [frames if settle_frames is None else settle_frames for frames in methods.settle_frames]
     turns = turns_of(loop, settle)
     _check(loop, turns, methods, settle)
     relative = relative_gains(loop, turns, methods.groups, methods.reference)

@@ -193,6 +193,14 @@ class LoopConfiguration:
         return cls.from_document(parse_text(text, where), where)
 
     @classmethod
+    def of_results(cls, text: str) -> LoopConfiguration | None:
+        """Return the configuration that results state; None if they state none, or one of another version."""
+        try:
+            return cls.from_text(text) if text else None
+        except InputError:
+            return None
+
+    @classmethod
     def from_document(cls, document: dict[str, Any], where: str) -> LoopConfiguration:
         """Make a configuration of the tables of a TOML file.
 
