@@ -50,8 +50,7 @@ def images_with_derivatives(
 _LARGEST = 1e6  # px, or fractions of the flux, for one pixel: above it, float32 sums are meaningless
 _SMALLEST_GAIN = 0.02
 _LEAST_WEIGHT = 1e-4  # of the largest: less counts nothing, and need not be read
-_RIDGE = 1e-6  # relative to the largest weight: indistinguishable in float32 sums
-# relative to the mean variance of a pixel: keeps the solution finite without noise
+_RIDGE = 1e-6  # of the mean variance of a pixel: keeps the solution finite without noise
 
 
 @dataclass(frozen=True, eq=False)
@@ -317,11 +316,6 @@ def _spot_and_gradients(psf: PSF, shape: tuple[int, int]) -> tuple[Floats, Float
     if not np.all(spot.max(axis=(1, 2)) > 0):
         raise InputError("psf: expected spots with flux in their windows, got none")
     return spot, along_x, along_y
-
-
-def _pairs(first: Floats, second: Floats) -> tuple[tuple[Floats, Floats], ...]:
-    """Return products of two maps, as needed for their normal equations."""
-    return (first, first), (first, second), (second, second)
 
 
 def _flux_weights(values: dict[str, Any]) -> Floats:

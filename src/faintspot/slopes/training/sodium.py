@@ -26,7 +26,7 @@ _RIDGE = 1e-9  # relative to the mean information on an altitude
 _CENTRED = 1e4  # information that the spots are centred, relative to that of the images
 _NEGLIGIBLE = 1e-6  # relative weight of a pixel, or relative chi-square
 _LEAST_VARIANCE = 1e-6  # relative to the mean of the images
-_SMOOTHNESS = 0.1
+_SMOOTHNESS = 0.1  # expected second difference of the density, relative to its peak
 _LARGEST_BLUR_FWHM = 2.0
 _SIGNIFICANT = 3.0  # ratio of mean squares (F test) by which spots must fit better than constant images
 
@@ -127,7 +127,6 @@ def fit_sodium_profile(
     profile: SodiumProfile,
     *,
     dark_variance_e2: ArrayLike = 0.0,
-    smoothness: float = _SMOOTHNESS,
 ) -> SodiumFit:
     """Return the sodium profile that all sub-apertures see, from their mean images.
 
@@ -144,8 +143,6 @@ def fit_sodium_profile(
         The profile so far, whose altitudes are kept. It gives the first weights.
     dark_variance_e2 : float or (n, ny, nx) array
         Variance of a dark pixel in one frame [electrons^2]; large for pixels to be ignored.
-    smoothness : float
-        Expected second difference of the density, as a fraction of its peak.
 
     Raises
     ------
@@ -165,22 +162,14 @@ def fit_sodium_profile(
     >>> print(f"{true.std_m / 1e3:.1f} km, {found.profile.std_m / 1e3:.1f} km")
     3.5 km, 3.5 km
     """
-    return _constrained(
-        _fitted(mean, star, profile, dark_variance_e2=dark_variance_e2, smoothness=smoothness)
-    )
+    return _constrained(_fitted(mean, star, profile, dark_variance_e2))
 
 
 def _fitted(
-    mean: MeanImages,
-    star: LaserGuideStar,
-    profile: SodiumProfile,
-    *,
-    dark_variance_e2: ArrayLike,
-    smoothness: float,
+    mean: MeanImages, star: LaserGuideStar, profile: SodiumProfile, dark_variance_e2: ArrayLike
 ) -> SodiumFit:
     """Return the profile, also where nothing constrains it."""
     dark = numbers_between("dark_variance_e2", dark_variance_e2, 0.0)
-    expected = number_between("smoothness", smoothness, 0.0, low_open=True)
     data, shape = mean.images_e, mean.images_e.shape
     if len(star) != len(data):
         raise InputError(f"images_e: expected {len(star)} sub-apertures as the star, got {len(data)}")
@@ -204,7 +193,7 @@ def _fitted(
         weighted = (weights[:, :, None] * per_density).reshape(-1, per_density.shape[-1])
         normal = weighted.T @ per_density.reshape(weighted.shape)
         right = weighted.T @ measured.ravel()
-        density = _solved(normal, right, centred, expected * density.max())
+        density = _solved(normal, right, centred, _SMOOTHNESS * density.max())
         density = SodiumProfile(profile.altitudes_m, density).density
     shapes = flat @ density
     residual = measured - flux[:, None] * shapes
@@ -239,7 +228,6 @@ def fit_spot(
     profile: SodiumProfile,
     *,
     dark_variance_e2: ArrayLike = 0.0,
-    smoothness: float = _SMOOTHNESS,
 ) -> tuple[LaserGuideStar, SodiumFit]:
     """Return the star with its spot blurred as much as the mean images show, and the profile.
 
@@ -271,8 +259,7 @@ def fit_spot(
         return replace(star, spot=star.spot.blurred(blur_px))
 
     def fitted(blur_px: float) -> SodiumFit:
-        options: dict[str, Any] = {"dark_variance_e2": dark_variance_e2, "smoothness": smoothness}
-        return _fitted(mean, blurred(blur_px), profile, **options)
+        return _fitted(mean, blurred(blur_px), profile, dark_variance_e2)
 
     widest = _LARGEST_BLUR_FWHM * float(star.spot.fwhm_px.mean())
     best = minimize_scalar(
