@@ -104,6 +104,7 @@ _LARGE_PX = 0.03  # constant error at the pupil's edge
     default=(),
     metavar="LIST",
     help="Sub-apertures to leave out, such as 3,17,40-45: their numbers in the picture drawn without this.",
+    show_default="none",
 )
 @_windows(
     "--pixels",
