@@ -62,11 +62,11 @@ class Estimate:
         return int(self.low > 0) - int(self.high < 0)
 
 
-# Slope errors -------------------------------------------------------------------------------------------
-
-
 UNKNOWN = Estimate(math.nan)
 """A number that is not known."""
+
+
+# Slope errors -------------------------------------------------------------------------------------------
 
 
 def absolute_errors(x: ArrayLike, y: ArrayLike, truth: ArrayLike) -> NDArray[np.float64]:

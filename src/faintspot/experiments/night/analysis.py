@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.report.texts import Texts
-from faintspot.base.statistics import Estimate
+from faintspot.base.statistics import UNKNOWN, Estimate
 from faintspot.experiments.night.alternation import coefficient, jackknife, predicted_by_others
 from faintspot.experiments.night.protocol import BEST_STRENGTHS, Night
 
@@ -145,7 +145,7 @@ def contrast(night: Night, chosen: Rows, others: Rows, seeing: Floats | None) ->
     """
     rows = (chosen | others) & np.isfinite(night.strehl)
     if min((chosen & rows).sum(), (others & rows).sum()) < _FEWEST_ROWS:
-        return Estimate(math.nan)
+        return UNKNOWN
     columns = [chosen[rows].astype(np.float64)]
     columns += [
         (night.set_number[rows] == number).astype(np.float64) for number in range(len(night.set_names))
@@ -257,7 +257,6 @@ def group_means(night: Night, rows: Rows) -> list[tuple[float, float, int]]:
 
 HOLDS, FAILS, OPEN = "holds", "does not hold", "not decided"
 _TEXT = Texts("faintspot.experiments.night")
-_NO_ESTIMATE = Estimate(math.nan)
 
 
 @dataclass(frozen=True)
@@ -311,7 +310,7 @@ def verdicts(night: Night) -> list[NightVerdict]:
         verdict.append(_of_difference("best", by_name[BEST]))
         measured = contrast(night, best, every & ~best, seeing)
         rows = every & np.isfinite(night.paired_strehl)
-        paired = _NO_ESTIMATE
+        paired = UNKNOWN
         if (rows & best).any() and (rows & ~best).any():
             design = np.column_stack([best[rows], np.ones(int(rows.sum()))]).astype(np.float64)
             change = (night.strehl - night.paired_strehl)[rows]
@@ -324,12 +323,12 @@ def verdicts(night: Night) -> list[NightVerdict]:
     if fits:
         slope = fits[0].slope_per_cm
         needed = hours_needed(slope.value, slope.standard_error, night.hours)
-        verdict.append(NightVerdict(_TEXT["statements.r0"], slope, _NO_ESTIMATE, " per cm", needed))
+        verdict.append(NightVerdict(_TEXT["statements.r0"], slope, UNKNOWN, " per cm", needed))
     return verdict
 
 
 def _of_difference(name: str, difference: Difference) -> NightVerdict:
-    paired = difference.paired or _NO_ESTIMATE
+    paired = difference.paired or UNKNOWN
     return NightVerdict(_TEXT[f"statements.{name}"], difference.measured, paired, "", difference.hours_needed)
 
 

@@ -79,7 +79,7 @@ class PosteriorTables(NamedTuple):
     grid: Any
     """(n_positions, 2) float32: x and y, px."""
     spacing: Any
-    """Of the grid, px."""
+    """Spacing of the grid, px."""
 
 
 class SpotScratch(NamedTuple):
