@@ -1,6 +1,7 @@
 """Learning from the telemetry of a running engine, in a process of lowest priority beside it."""
 
 import signal
+import sys
 import tempfile
 import threading
 import time
@@ -172,13 +173,13 @@ def background_learning(
         engine.learning = {"fault": text}
         say(f"winds are not learnt again, the loop goes on: {text}")
 
-    arguments = "--config", f"{config}", "--name", engine.name, "--every", f"{every_s:g}"
+    arguments = engine.name, f"{config}", f"{every_s}"
     done = threading.Event()
     with (
         tempfile.TemporaryDirectory(prefix="faintspot-learn-") as folder,
         ChildProcesses(Path(folder)) as children,
     ):
-        children.start("learn", ["realtime", "learn", *arguments], ONE_THREAD)
+        children.start("learn", arguments, ONE_THREAD, "faintspot.engine.background")
         watcher = threading.Thread(target=_watch, args=(children, done, fault), daemon=True)
         watcher.start()
         try:
@@ -197,3 +198,11 @@ def _watch(children: ChildProcesses, done: threading.Event, on_fault: Callable[[
             if not done.wait(_WATCH_S):  # else the engine has ended, too
                 on_fault(f"{error}")
             return
+
+
+if __name__ == "__main__":
+    engine_name, configuration, seconds = sys.argv[1:]
+    try:
+        BackgroundLearning(engine_name, configuration, float(seconds)).run(print)
+    except InputError as fault:
+        sys.exit(f"{fault}")

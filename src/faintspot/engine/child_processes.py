@@ -41,9 +41,13 @@ class ChildProcesses(Closing):
         self._started: dict[str, subprocess.Popen[bytes]] = {}
 
     def start(
-        self, name: str, arguments: Sequence[str], environment: Mapping[str, str] | None = None
+        self,
+        name: str,
+        arguments: Sequence[str],
+        environment: Mapping[str, str] | None = None,
+        module: str = "faintspot",
     ) -> None:
-        """Start `faintspot ARGUMENTS`; the calling thread must live as long as the process is needed.
+        """Start `python -m MODULE ARGUMENTS`; the calling thread must live as long as the process is needed.
 
         Parameters
         ----------
@@ -51,6 +55,8 @@ class ChildProcesses(Closing):
         arguments : sequence of str
         environment : mapping, optional
             Variables to set for it.
+        module : str
+            Default: the command line.
 
         Raises
         ------
@@ -63,7 +69,7 @@ class ChildProcesses(Closing):
             log = os.open(self._log(name), os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
         try:
             self._started[name] = subprocess.Popen(
-                [sys.executable, "-m", "faintspot", *arguments],
+                [sys.executable, "-m", module, *arguments],
                 stdin=subprocess.DEVNULL,
                 stdout=log,
                 stderr=log,

@@ -45,9 +45,9 @@ class ControlLoop:
     control : Control
     layout : Layout
         Layout with as many sub-apertures as the control.
-    held : (commands,) array, optional
+    commands : (commands,) array, optional
         The mirror's commands at the start. Default: flat.
-    prior : Prior, optional
+    prior : SlopePrior, optional
         Receives the prediction of the next frame's slopes from a predictive controller while the loop is
         closed.
     threads : int

@@ -189,7 +189,7 @@ class EngineEstimators:
 
     Parameters
     ----------
-    live : LiveSettings
+    live : RunningSettings
     preparer : SettingsPreparer
     """
 

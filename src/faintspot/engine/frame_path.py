@@ -139,7 +139,7 @@ class FramePath:
     progress : Progress
     workers : Workers, optional
         Threads that measure together with the caller. Default: the caller's thread alone.
-    prior : Prior, optional
+    prior : SlopePrior, optional
         Predicted slopes, which the caller changes between frames. Default: 0.
 
     Raises

@@ -143,7 +143,7 @@ class SettingsPreparer:
     workers : Workers, optional
     budget_s : float
         Time limit for one frame of an estimator in NumPy.
-    prior : Prior, optional
+    prior : SlopePrior, optional
         Predicted slopes; see `FramePath`.
     """
 
@@ -331,7 +331,7 @@ class FluxFollower:
 
     Parameters
     ----------
-    live : LiveSettings
+    live : RunningSettings
     time_constant_frames : float
 
     Raises

@@ -61,12 +61,7 @@ def _stop(engine: Engine, fields: Mapping[str, object]) -> Mapping[str, object]:
 
 def _take_learnt(engine: Engine, fields: Mapping[str, object]) -> Mapping[str, object]:
     """Note what is learnt beside the engine, and take the new model, if one is handed over."""
-    learning: dict[str, object] = {
-        "found": _text(fields, "found"),
-        "unix_time_s": time.time(),
-        "taken": bool(fields.get("taken", False)),
-        "running": bool(fields.get("running", False)),
-    }
+    learning = {"found": _text(fields, "found"), "unix_time_s": time.time(), "taken": False}
     engine.learning = learning
     if fields.get("model") is None:
         return {}
@@ -77,9 +72,9 @@ def _take_learnt(engine: Engine, fields: Mapping[str, object]) -> Mapping[str, o
     try:
         engine.loop.renew(Kalman.load(_text(fields, "model"), engine.loop.control.plant))
     except InputError as error:
-        engine.learning = {**learning, "fault": f"{error}"}
+        engine.learning = learning | {"fault": f"{error}"}
         raise
-    engine.learning = {**learning, "taken": True}
+    engine.learning = learning | {"taken": True}
     return {}
 
 

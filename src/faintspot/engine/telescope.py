@@ -234,7 +234,7 @@ class SimulatedTelescope(Readout, Closing):
             return super().run(n_frames, stop, progress)
 
     def order(self, changes: Mapping[str, object]) -> Order:
-        """Change conditions from the next exposure on; see `telescope_orders.ORDERS`.
+        """Change conditions from the next exposure on; see `ORDERS`.
 
         Raises
         ------

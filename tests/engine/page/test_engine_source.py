@@ -12,8 +12,7 @@ from faintspot.engine.telemetry.ring import TelemetryRing
 from faintspot.engine.telescope import TRUTH
 
 
-def test_engine_that_comes_goes_and_comes_back(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("faintspot.engine.page.engine_source._STALE_S", 0.0)
+def test_engine_that_comes_goes_and_comes_back(name: str) -> None:
     source = EngineSource(name)
     assert source.read() is None
     assert not source.state()["there"]

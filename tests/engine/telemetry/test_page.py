@@ -60,11 +60,8 @@ def night(path: Path) -> Telemetry:
 
 
 def test_rates_and_lost_frames(night: Telemetry) -> None:
-    found = timing(night)
-    assert found.rate_hz == pytest.approx(1000)
-    assert found.longest_interval_s == pytest.approx(1e-3)
-    assert found.latency_s[-1] == pytest.approx(60e-6)
-    assert [(gap.after_frame, gap.lost) for gap in gaps(night)] == [(709, 12)]
+    assert timing(night) == pytest.approx((1000, 1e-3))
+    assert gaps(night).tolist() == [12]
     frame, time_s, *words = change_rows(night)[0]
     assert (frame, *words) == (510, "noise_std = 2.5", "1, 2")
     assert time_s == pytest.approx(0.5)

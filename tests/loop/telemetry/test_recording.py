@@ -161,16 +161,15 @@ def test_from_the_command_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     configuration_file.save(path, Settings("brightest"))
     np.save(tmp_path / "m.npy", INTERACTION)
 
-    def learn(*options: str) -> Any:
-        arguments = ["night.zarr", "--config", str(path), *options]
+    def learn() -> Any:
+        arguments = ["night.zarr", "--config", str(path)]
         return CliRunner().invoke(realtime_learn.learn, arguments, standalone_mode=False)
 
-    assert "expected either STORE or --every" in str(learn("--every", "5").exception)
     assert "expected a table [control]" in str(learn().exception)
     save_control(path, interaction_matrix="m.npy", centroid_gain=GAIN)
     pytest.importorskip("zarr")
     monkeypatch.setattr("faintspot.io.read_telemetry", lambda *_, **__: recording())
-    result = learn("--winds", "none")
+    result = learn()
     assert result.exception is None, result.exception
     assert "658 frames at 250 a second: the filter leaves 0." in result.output
     assert "left out 1 of 9 sub-apertures: dark" in result.output

@@ -55,8 +55,6 @@ def learnt_in_words(learning: dict[str, Any]) -> str:
     """Describe the latest learning beside an engine."""
     if "found" not in learning:
         return f"not again: {learning['fault']}"
-    if learning["running"]:
-        return f"now, {learning['found']}"
     seconds, fault = time.time() - learning["unix_time_s"], learning.get("fault")
     taken = f"refused: {fault}" if fault else "taken" if learning["taken"] else "not taken"
     return f"{seconds:.0f} s ago: {learning['found']}; {taken}"

@@ -184,10 +184,9 @@ class LiveDemonstration:
         self, engine: Path, window: str, processes: ChildProcesses, watcher: _Watcher, say: Say
     ) -> None:
         """Learn a Kalman filter from the telemetry while other methods take turns; then let it, too."""
-        store, found = self.folder / "telemetry.zarr", f"from {_LEARN_FRAMES} frames of the closed loop"
+        store = self.folder / "telemetry.zarr"
         shutil.rmtree(store, ignore_errors=True)
-        self._asked("learnt", found=found, running=True)
-        say(f"a Kalman filter is learnt {found}")
+        say(f"a Kalman filter is learnt from {_LEARN_FRAMES} frames of the closed loop")
         recording = [str(store), "--name", self.name, "--frames", str(_LEARN_FRAMES)]
         processes.start(_RECORDER, ["realtime", "record", *recording])
         watcher.watch(_COMPILING_S, until=lambda: processes.finished(_RECORDER))
@@ -200,10 +199,8 @@ class LiveDemonstration:
             if watcher.stopped():
                 return
             self._interleave([*methods, _FILTER], watcher.shown)
-            self._asked("learnt", found=found, taken=True)
         except InputError as error:
             say(f"no filter takes turns: {error}")
-            self._asked("learnt", found=f"no filter, {error}")
 
     def _interleave(self, methods: list[str], shown: Shown) -> None:
         """Let methods take turns from now on."""

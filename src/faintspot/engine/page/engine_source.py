@@ -19,7 +19,6 @@ from faintspot.engine.telescope import TRUTH
 from faintspot.io.telemetry import StoredTelemetry, stored_names
 from faintspot.slopes.sensor.layout import Layout
 
-_STALE_S = 0.25  # between two checks whether the engine is alive
 _TRUTH_FIELDS = tuple(TRUTH.index(name) for name in ("strehl", "rms_nm"))
 
 
@@ -46,7 +45,6 @@ class EngineSource:
         self._reader: TelemetryRing | None = None
         self._truth, self._commands = Follower(f"{name}_truth"), Follower(f"{name}_commands")
         self._cursors = [0, 0, 0]  # records, images, changes
-        self._asked_s = 0.0
 
     def read(self) -> Batch | None:
         """Return the data since the last call; None while there is no engine."""
@@ -63,8 +61,9 @@ class EngineSource:
         if len(images):
             newest = images[-1]
             picture = Picture(int(newest["image_frame"]), newest["raw"], newest["denoised"])
-        if not len(records):
-            self._let_go_if_stale(reader)
+        if not len(records) and reader.stale:  # all of it has been read
+            reader.close()
+            self._reader = None
         commands = self._commands.newest()
         return Batch(
             records,
@@ -102,15 +101,6 @@ class EngineSource:
         self.methods = reader.description["methods"]
         self._cursors = [reader.records.written, max(0, reader.images.written - 1), 0]
         return True
-
-    def _let_go_if_stale(self, reader: TelemetryRing) -> None:
-        """Close the telemetry of an engine that has ended, after reading all of it."""
-        if time.monotonic() - self._asked_s < _STALE_S:
-            return
-        self._asked_s = time.monotonic()
-        if reader.stale:
-            reader.close()
-            self._reader = None
 
     def _newest_truth(self) -> tuple[int, float, float] | None:
         truth = self._truth.newest()

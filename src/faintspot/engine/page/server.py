@@ -59,7 +59,7 @@ class LiveServer:
     Parameters
     ----------
     source : BatchSource
-    client_requests : Wishes
+    client_requests : ClientRequests
         Requests that clients may make.
     access : Access
     address : str

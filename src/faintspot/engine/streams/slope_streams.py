@@ -243,7 +243,7 @@ class PredictionStream:
     ----------
     name : str
         Name of the engine.
-    prior : Prior
+    prior : SlopePrior
         Prior that receives the predictions.
 
     Raises

@@ -6,34 +6,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.base.statistics import Estimate, mean_by_blocks
+from faintspot.base.statistics import UNKNOWN, Estimate, mean_by_blocks
 from faintspot.io.telemetry import Telemetry, all_left_out
 
 Floats = NDArray[np.float64]
 
-PERCENTILES = (50.0, 99.0, 99.9, 100.0)
 _LONGEST = 80  # text of a changed value
 _TURNS_TOGETHER = 10  # neighbouring turns of the bootstrap's blocks: the turbulence changes slowly
-
-
-@dataclass(frozen=True)
-class Timing:
-    """When frames came and how long they took."""
-
-    rate_hz: float
-    """Frame rate: one over the median interval between consecutive frames; NaN without any."""
-    longest_interval_s: float
-    """Between consecutive numbers."""
-    latency_s: Floats
-    """At `PERCENTILES`."""
-
-
-@dataclass(frozen=True)
-class Gap:
-    """Frames that are not in the record."""
-
-    after_frame: int
-    lost: int
 
 
 @dataclass(frozen=True)
@@ -46,21 +25,22 @@ class MethodDifference:
     """None of the first method."""
 
 
-def timing(telemetry: Telemetry) -> Timing:
-    """Return the timing of the frames recorded."""
+def timing(telemetry: Telemetry) -> tuple[float, float]:
+    """Return the frame rate [Hz] and the longest interval [s] of consecutive frame numbers; NaN without any.
+
+    The rate is one over the median interval.
+    """
     interval = np.diff(telemetry.last_row_time_ns)[np.diff(telemetry.frame) == 1] / 1e9
-    has_interval = interval.size > 0
-    return Timing(
-        float(1 / np.median(interval)) if has_interval and np.median(interval) > 0 else np.nan,
-        float(interval.max()) if has_interval else np.nan,
-        np.percentile(telemetry.latency_s, PERCENTILES),
-    )
+    if not interval.size:
+        return np.nan, np.nan
+    median = np.median(interval)
+    return float(1 / median) if median > 0 else np.nan, float(interval.max())
 
 
-def gaps(telemetry: Telemetry) -> list[Gap]:
-    """Return where frame numbers are missing; none are where the camera began anew."""
+def gaps(telemetry: Telemetry) -> NDArray[np.int64]:
+    """Return the numbers of frames missing in each gap of the record; none where the camera began anew."""
     lost = all_left_out(telemetry.frame)
-    return [Gap(int(telemetry.frame[i]), int(lost[i])) for i in np.flatnonzero(lost > 0)]
+    return lost[lost > 0]
 
 
 def restarts(telemetry: Telemetry) -> int:
@@ -145,7 +125,7 @@ def _by_turn(methods: NDArray[np.int64], method: int, values: Floats) -> Floats:
 
 def _mean(values: Floats, comparisons: int = 1) -> Estimate:
     kept = values[np.isfinite(values)]
-    return mean_by_blocks(kept, _TURNS_TOGETHER, comparisons=comparisons) if kept.size else Estimate(np.nan)
+    return mean_by_blocks(kept, _TURNS_TOGETHER, comparisons=comparisons) if kept.size else UNKNOWN
 
 
 def change_rows(telemetry: Telemetry) -> Sequence[tuple[int, float, str, str]]:

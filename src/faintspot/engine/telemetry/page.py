@@ -12,7 +12,6 @@ from faintspot.base.report.page import POSITIONS, FigureWithData, Report, Sectio
 from faintspot.base.report.plots import GREY, METHOD_COLOURS, Line, Panel
 from faintspot.base.report.texts import Texts
 from faintspot.engine.telemetry.numbers import (
-    PERCENTILES,
     change_rows,
     gaps,
     method_names,
@@ -29,6 +28,7 @@ from faintspot.slopes.sensor.layout import Layout
 
 _TEXT = Texts("faintspot.slopes.recorded")
 _MOST_CHANGES = 200
+_PERCENTILES = (50.0, 99.0, 99.9, 100.0)
 _BINS = 80
 # Points of the course in time, frames in each, and so many points that they are drawn as dots.
 _MOST_TIMES, _FEWEST_TOGETHER, _FEW_TIMES = 400, 50, 20
@@ -96,7 +96,7 @@ def _facts(telemetry: Telemetry, path: Path) -> dict[str, str]:
 
 
 def _warnings(telemetry: Telemetry) -> list[str]:
-    lost = sum(gap.lost for gap in gaps(telemetry))
+    lost = int(gaps(telemetry).sum())
     return _TEXT.lines(
         "telemetry.warnings",
         lost=lost or None,
@@ -106,17 +106,17 @@ def _warnings(telemetry: Telemetry) -> list[str]:
 
 
 def _timing(telemetry: Telemetry) -> Section:
-    measured, lost = timing(telemetry), [gap.lost for gap in gaps(telemetry)]
+    (rate_hz, longest_s), lost = timing(telemetry), gaps(telemetry).tolist()
     rows = []
     for name, frames in _methods(telemetry):
         us = 1e6 * telemetry.latency_s[frames]
-        rows.append([name, str(len(us)), *(f"{value:.1f}" for value in np.percentile(us, PERCENTILES))])
+        rows.append([name, str(len(us)), *(f"{value:.1f}" for value in np.percentile(us, _PERCENTILES))])
     return _TEXT.section(
         "timing",
         _TEXT.table("timing", rows),
         latency_figure(telemetry),
-        rate=measured.rate_hz if np.isfinite(measured.rate_hz) else None,
-        longest_ms=1e3 * measured.longest_interval_s,
+        rate=rate_hz if np.isfinite(rate_hz) else None,
+        longest_ms=1e3 * longest_s,
         lost=sum(lost) or None,
         gaps=len(lost),
         longest=max(lost, default=0),

@@ -116,7 +116,6 @@ def _columns(items: NDArray[Any]) -> list[tuple[str, NDArray[Any]]]:
 _POLL_S = 0.01
 _FLUSH_S = 1.0
 _FLUSH_BYTES = 1 << 26  # amount of buffered data that is written at once
-_STALE_S = 0.25  # between two checks whether the engine is alive
 _MOST_RECORDS, _MOST_IMAGES = 1024, 4  # read at once
 
 
@@ -204,7 +203,7 @@ class Recorder:
         }
         self._store = TelemetryStore(path, reader.records.kind, reader.images.kind, attributes)
         self._frames_read = 0
-        self._longest_write_s = self._written_at = self._asked_at = 0.0
+        self._longest_write_s = self._written_at = 0.0
 
     def run(
         self,
@@ -250,7 +249,7 @@ class Recorder:
                 progress(self._frames_read)
             self._write_in_turn()
             if not (something or ended):
-                gone = self._gone()
+                gone = self._reader.stale
                 time.sleep(_POLL_S)
         self._images.read(sys.maxsize)  # those of the last frames, of which many may have come at once
         self._write({"complete": True, "ended_because": ended})
@@ -275,13 +274,6 @@ class Recorder:
             "dropped_images": self._images.dropped,
             "dropped_changes": self._dropped_changes,
         }
-
-    def _gone(self) -> bool:
-        """Return whether the engine has ended; checks only now and then."""
-        if time.monotonic() - self._asked_at < _STALE_S:
-            return False
-        self._asked_at = time.monotonic()
-        return self._reader.stale
 
     def _write_in_turn(self) -> None:
         """Write the buffered data if it is time, or if there is much of it."""

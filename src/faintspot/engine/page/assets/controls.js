@@ -14,9 +14,8 @@ function answer(id, reply) {
   place.textContent = reply.ok ? reply.text || "done" : reply.error;
 }
 
-function learntInWords({ found, taken, fault, running, unix_time_s }) {
+function learntInWords({ found, taken, fault, unix_time_s }) {
   if (!found) return `Not learnt again: ${fault}`;
-  if (running) return `Learning a Kalman filter: ${found}`;
   const time = new Date(1000 * unix_time_s).toLocaleTimeString("en-GB");
   const outcome = fault ? `refused: ${fault}` : taken ? "taken" : "not taken";
   return `Kalman filter learnt at ${time}: ${found}; ${outcome}`;
