@@ -6,8 +6,9 @@ import hashlib
 import itertools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypedDict, Unpack
+from typing import TYPE_CHECKING, Any, NamedTuple, TypedDict, Unpack
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,6 +35,7 @@ from faintspot.slopes.sensor.layout import Layout
 from faintspot.slopes.sensor.window_checks import reference_in_words
 
 if TYPE_CHECKING:
+    from faintspot.io.slopes_writer import SlopeWriter
     from faintspot.slopes.pipeline.following import SpotFollower
 
 _BLOCK_BYTES = 1 << 25  # of float32 frames: large enough for all threads, small beside any memory
@@ -162,65 +164,102 @@ def measure_recorded(
     described, origin, positions = configured(configuration_file, frames, key)
     if reference is not None:
         positions = read_reference(reference) if isinstance(reference, str | Path) else reference
-    layout, settings = described.layout, _settings(described.settings, choices)
+    layout = described.layout
     with open_frames(frames, key=key, time_axis=choices.get("time_axis")) as source:
         _check_files(source, frames, output, layout, configuration_file)
-        summary = Summary(source.n_frames, len(layout), doubtful=bool(layout.doubts))
-        reference_words = "" if positions is not None else reference_in_words(layout.fitted)
         seen = survey(source.shape, stretches(source))
-        try:
-            calibration, notes = _calibration(described.calibration, settings, layout, seen)
-            summary.notes = [note for note in (origin, *notes, reference_words) if note]
-            spot: dict[str, Any] = described.spot
-            pipeline = SlopePipeline(layout, settings, calibration, positions, **spot, threads=threads)
-        except InputError as error:
-            about_reference = positions is not None and error.name == "reference"
-            file = reference if about_reference and isinstance(reference, str | Path) else configuration_file
-            raise error.within(file) from None
+        pipeline, notes = _pipeline(described, positions, seen, choices, threads)
         if choices.get("mean_flux", False):
             pipeline = _with_mean_flux(pipeline, source)
         attributes = _attributes(pipeline, source, frames, described, choices)
-        factor = pixels_in(one_of("unit", attributes["unit"], UNITS), attributes)
         if positions is not None:
             attributes["reference"] = np.asarray(positions).tolist()
         with errors_within(configuration_file):
-            measure: SlopePipeline | SpotFollower = pipeline.with_dark(seen.mean)
-            if follow:
-                from faintspot.slopes.pipeline.following import SpotFollower
-
-                measure = SpotFollower(pipeline)
-
-        def shown() -> dict[str, Any]:
-            if not isinstance(measure, SlopePipeline) or source.n_frames < _FRAMES_FOR_RESPONSE:
-                return {}
-            return {"response": response(measure, seen.mean, frames_apart(source)).tolist()}
-
-        prepared, last = measure.plan.prepared, None
-        faults = prepared.faults
+            measure = _measuring(pipeline, seen, follow=follow)
+        summary = Summary(source.n_frames, len(layout), doubtful=bool(layout.doubts))
+        summary.notes = [note for note in (origin, *notes) if note]
+        factor = pixels_in(one_of("unit", attributes["unit"], UNITS), attributes)
         with create_writer(
             output,
             n_frames=source.n_frames,
             n_subapertures=len(layout),
             attributes=attributes,
-            measured_attributes=shown,
+            measured_attributes=partial(_response, measure, seen, source),
             coordinates=layout_coordinates(layout),
             overwrite=overwrite,
         ) as writer:
-            summary.resumed_at = done = writer.finished()
-            size = block_frames or _block_frames(source, follow)
-            again = source.blocks(0, done, size) if follow and done < source.n_frames else ()
-            for start, block in itertools.chain(again, source.blocks(done, source.n_frames, size)):
-                slopes = replace(measure(block), keep=kept)
-                if start >= done:
-                    writer.append(start, scaled_positions(slopes.variables, factor))
-                    summary.add(slopes)
-                    summary.repeated_frames += int(np.count_nonzero(are_repeated(block, last)))
-                last = block[-1]
-                if progress is not None:
-                    progress(start + len(block), source.n_frames)
-    if failed := prepared.faults - faults:
-        summary.notes.append(f"{failed} frames without slopes: {prepared.fault}")
+            _Run(source, measure, kept, follow, factor).write(writer, block_frames, summary, progress)
     return summary
+
+
+class _Run(NamedTuple):
+    """Frames, and how they are measured."""
+
+    source: FrameSource
+    measure: SlopePipeline | SpotFollower
+    kept: SubapertureFlag
+    follow: bool
+    factor: float
+    """Pixels in the unit of the output."""
+
+    def write(
+        self, writer: SlopeWriter, block_frames: int | None, summary: Summary, progress: Progress | None
+    ) -> None:
+        """Measure the frames that are not finished, and count what they show."""
+        source, prepared, last = self.source, self.measure.plan.prepared, None
+        summary.resumed_at = done = writer.finished()
+        faults, size = prepared.faults, block_frames or _block_frames(source, self.follow)
+        again = source.blocks(0, done, size) if self.follow and done < source.n_frames else ()
+        for start, block in itertools.chain(again, source.blocks(done, source.n_frames, size)):
+            slopes = replace(self.measure(block), keep=self.kept)
+            if start >= done:
+                writer.append(start, scaled_positions(slopes.variables, self.factor))
+                summary.add(slopes)
+                summary.repeated_frames += int(np.count_nonzero(are_repeated(block, last)))
+            last = block[-1]
+            if progress is not None:
+                progress(start + len(block), source.n_frames)
+        if failed := prepared.faults - faults:
+            summary.notes.append(f"{failed} frames without slopes: {prepared.fault}")
+
+
+def _pipeline(
+    described: Configuration,
+    positions: NDArray[Any] | None,
+    seen: Survey,
+    choices: Choices,
+    threads: int | None,
+) -> tuple[SlopePipeline, list[str]]:
+    """Return the pipeline of the configuration and of what the frames show, and notes on the latter."""
+    layout, reference = described.layout, choices.get("reference")
+    settings = _settings(described.settings, choices)
+    try:
+        calibration, notes = _calibration(described.calibration, settings, layout, seen)
+        spot: dict[str, Any] = described.spot
+        pipeline = SlopePipeline(layout, settings, calibration, positions, **spot, threads=threads)
+    except InputError as error:
+        about_reference = positions is not None and error.name == "reference"
+        is_file = about_reference and isinstance(reference, str | Path)
+        raise error.within(reference if is_file else described.path) from None
+    return pipeline, [*notes, "" if positions is not None else reference_in_words(layout.fitted)]
+
+
+def _measuring(pipeline: SlopePipeline, seen: Survey, *, follow: bool) -> SlopePipeline | SpotFollower:
+    """Return the pipeline, or windows that follow their spots."""
+    if not follow:
+        return pipeline.with_dark(seen.mean)
+    from faintspot.slopes.pipeline.following import SpotFollower
+
+    return SpotFollower(pipeline)
+
+
+def _response(
+    measure: SlopePipeline | SpotFollower, seen: Survey, source: FrameSource
+) -> dict[str, list[float]]:
+    """Return the response of each sub-aperture as an attribute, if there are enough frames."""
+    if not isinstance(measure, SlopePipeline) or source.n_frames < _FRAMES_FOR_RESPONSE:
+        return {}
+    return {"response": response(measure, seen.mean, frames_apart(source)).tolist()}
 
 
 def _settings(settings: Settings, choices: Choices) -> Settings:
