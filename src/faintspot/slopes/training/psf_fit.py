@@ -1,6 +1,7 @@
 """The PSF that fits stacked spots best: a product of two profiles, and where the data ask for it more."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -61,7 +62,7 @@ def spline_basis(at: Floats, radius_px: float, nodes_per_px: float) -> Floats:
 
 def fit_psf(sums: Sums, form: Form, radius_px: float) -> PSFFit:
     """Return the PSF of a given form that fits best, point-symmetric."""
-    symmetric = sums.folded(lambda plane: plane[::-1, ::-1])
+    symmetric = sums.folded(sums.planes[:, ::-1, ::-1])
     moments = core_moments(symmetric)
     (short, long), axes = np.linalg.eigh(moments)
     angle = 0.0
@@ -74,8 +75,8 @@ def fit_psf(sums: Sums, form: Form, radius_px: float) -> PSFFit:
 
 def held_out_loss(sums: Sums, fit: PSFFit) -> float:
     """Return the weighted square of what a fit to other spots leaves, but for a constant."""
-    b = fit.background_e
-    flux = sums.square * fit.plane**2 - 2 * fit.plane * (sums.product - b * sums.cross)
+    b, (square, cross, product) = fit.background_e, sums.planes
+    flux = square * fit.plane**2 - 2 * fit.plane * (product - b * cross)
     return float(flux.sum() + b * b * sums.weight - 2 * b * sums.image)
 
 
@@ -106,9 +107,10 @@ def core_moments(sums: Sums) -> Floats:
     Moments weighted with a Gaussian of the spot's own shape (Bernstein & Jarvis 2002, AJ 123, 583): wings
     and noise far out do not count.
     """
-    u = offsets(len(sums.square))
+    square, _, product = sums.planes
+    u = offsets(len(square))
     y, x = np.meshgrid(u, u, indexing="ij")
-    flux = np.divide(sums.product, sums.square, out=np.zeros_like(sums.square), where=sums.square > 0)
+    flux = np.divide(product, square, out=np.zeros_like(square), where=square > 0)
     moments = np.diag([1.5, 1.5])
     for _ in range(_MOMENT_STEPS):
         inverse = np.linalg.inv(moments)
@@ -126,26 +128,24 @@ def _turned(sums: Sums, angle: float) -> Sums:
     """Return the sums on a grid whose x axis lies at that angle."""
     if angle == 0.0:
         return sums
-    side = len(sums.square)
+    side = sums.planes.shape[1]
     middle = (side - 1) // 2
     row, column = np.indices((side, side)) - middle
     x = np.rint(np.cos(angle) * column + np.sin(angle) * row).astype(np.int64) + middle
     y = np.rint(np.cos(angle) * row - np.sin(angle) * column).astype(np.int64) + middle
     inside = (x >= 0) & (x < side) & (y >= 0) & (y < side)
     cell = (y * side + x)[inside]
-    square, cross, product = (
-        np.bincount(cell, plane[inside], side * side).reshape(side, side).astype(np.float64)
-        for plane in sums.planes
-    )
-    return Sums(square, cross, product, sums.weight, sums.image)
+    planes = [np.bincount(cell, plane[inside], side * side).reshape(side, side) for plane in sums.planes]
+    return replace(sums, planes=np.stack(planes))
 
 
 def _product(sums: Sums, form: Form, radius_px: float, angle: float, stds: Floats) -> PSFFit:
     """Alternate least squares for both profiles and the background; mirror-symmetric along both axes."""
-    turned = _turned(sums, angle).folded(lambda plane: plane[:, ::-1])
+    turned = _turned(sums, angle)
+    turned = turned.folded(turned.planes[:, :, ::-1])
     if form.square:
-        turned, stds = turned.folded(np.transpose), np.full(2, np.sqrt(np.mean(stds**2)))
-    u = offsets(len(sums.square))
+        turned, stds = turned.folded(turned.transposed().planes), np.full(2, np.sqrt(np.mean(stds**2)))
+    u = offsets(sums.planes.shape[1])
     basis = spline_basis(u, radius_px, NODES_PER_PX)
     gaussians = np.exp(-0.5 * (u / stds[:, None]) ** 2)
     nodes = np.linalg.lstsq(basis, gaussians.T, rcond=None)[0].T
@@ -154,7 +154,7 @@ def _product(sums: Sums, form: Form, radius_px: float, angle: float, stds: Float
     for _ in range(_SWEEPS):
         profile_x, _ = _profile(turned, profile_y, basis, nodes[0], form.bend)
         profile_x = profile_x / max(float(profile_x.max()), _TINY)
-        profile_y, background = _profile(_transposed(turned), profile_x, basis, nodes[1], form.bend)
+        profile_y, background = _profile(turned.transposed(), profile_x, basis, nodes[1], form.bend)
     if angle == 0.0:
         plane = np.outer(profile_y, profile_x)
         return PSFFit(0.5 * (plane + plane.T) if form.square else plane, background)
@@ -163,16 +163,13 @@ def _product(sums: Sums, form: Form, radius_px: float, angle: float, stds: Float
     return PSFFit(along * np.interp(np.cos(angle) * y - np.sin(angle) * x, u, profile_y, 0, 0), background)
 
 
-def _transposed(sums: Sums) -> Sums:
-    return Sums(sums.square.T, sums.cross.T, sums.product.T, sums.weight, sums.image)
-
-
 def _profile(sums: Sums, other: Floats, basis: Floats, gaussian: Floats, bend: float) -> tuple[Floats, float]:
     """Least squares for the profile along columns and the background, the other profile given.
 
     Its second differences are held to those of a Gaussian (spline coefficients), scaled to the same height.
     """
-    square, cross, product = other**2 @ sums.square, other @ sums.cross, other @ sums.product
+    square, cross, product = sums.planes
+    square, cross, product = other**2 @ square, other @ cross, other @ product
     n = basis.shape[1]
     normal = np.empty((n + 1, n + 1))
     normal[:n, :n] = (basis.T * square) @ basis
@@ -192,7 +189,7 @@ def _profile(sums: Sums, other: Floats, basis: Floats, gaussian: Floats, bend: f
 
 def _with_deviation(sums: Sums, fit: PSFFit, deviation: float, radius_px: float) -> PSFFit:
     """Add to the product what the data say beyond it, shrunk towards nothing; point-symmetric."""
-    product, background = fit
+    (square, cross, image), (product, background) = sums.planes, fit
     u = offsets(len(product))
     nodes_per_px = NODES_PER_PX if 2 * radius_px * NODES_PER_PX <= _MOST_NODES else 1
     basis = spline_basis(u, radius_px, nodes_per_px)
@@ -200,9 +197,9 @@ def _with_deviation(sums: Sums, fit: PSFFit, deviation: float, radius_px: float)
     reach = (n - 1) // 2
     node = (len(u) - 1) // 2 + np.arange(-reach, reach + 1) * (FINE // nodes_per_px)
     expected = np.abs(product[np.ix_(node, node)]) + _DEVIATION_FLOOR * product.max()
-    normal = _normal_matrix(sums.square, basis)
+    normal = _normal_matrix(square, basis)
     normal[range(n * n), range(n * n)] += 1 / (deviation * expected.ravel()) ** 2
-    remaining = sums.product - sums.square * product - background * sums.cross
+    remaining = image - square * product - background * cross
     right = (basis.T @ remaining @ basis).ravel()
     half = n * n // 2 + 1  # coefficient i is the same as i from the end
     right = right[:half] + right[: half - 2 : -1]
@@ -212,7 +209,7 @@ def _with_deviation(sums: Sums, fit: PSFFit, deviation: float, radius_px: float)
     first[-1] *= 2  # the middle one, added to itself
     coefficients = np.concatenate([first, first[-2::-1]]).reshape(n, n)
     plane = product + basis @ coefficients @ basis.T
-    background = (sums.image - float((sums.cross * plane).sum())) / max(sums.weight, _TINY)
+    background = (sums.image - float((cross * plane).sum())) / max(sums.weight, _TINY)
     return PSFFit(0.5 * (plane + plane[::-1, ::-1]), background)
 
 

@@ -15,14 +15,12 @@ from faintspot.slopes.estimators.noise import pixel_noise
 from faintspot.slopes.sensor.layout import Layout
 from faintspot.slopes.spots.psf import PSF
 from faintspot.slopes.training.psf_rounds import (
+    Learning,
     LearningOptions,
-    State,
     check_phases,
     gaussian_psf,
-    learn,
     measured_width,
     psf_of,
-    registered,
     usable_subapertures,
 )
 from faintspot.slopes.training.registration import Registered, Stack
@@ -230,20 +228,18 @@ def fit_spots(
     """
     stack = image_stack(images, Calibration() if calibration is None else calibration)
     n, shape = len(stack.images), (stack.images.shape[1], stack.images.shape[2])
-    index = np.zeros(n, np.int64)
     single = PSF(psf.samples[:1], psf.oversampling)
     options = _within(
         LearningOptions(max(shape) // 2 + 1, psf.oversampling, 0, min(shape) / 2), search_range_px
     )
     border = np.ones(shape, dtype=bool)
     border[1:-1, 1:-1] = False
-    state, wings = State(single, np.zeros(1)), np.zeros((n, *shape))
+    learning, wings = Learning(stack, np.zeros(n, np.int64), single, options), np.zeros((n, *shape))
     for _ in range(_BACKGROUND_ROUNDS):
-        background = float(np.median(np.mean((stack.images - wings)[:, border], axis=1)))
-        state = registered(stack, index, replace(state, background_e=np.array([background])), options)
-        spots = not_none(state.spots)
+        learning.background_e[0] = np.median(np.mean((stack.images - wings)[:, border], axis=1))
+        spots, _ = learning.register()
         wings = single.images(spots.positions, shape, spots.flux_e)
-    return LearntPSF(single, state.background_e, spots.positions, spots.flux_e, spots.error_px)
+    return LearntPSF(single, learning.background_e, spots.positions, spots.flux_e, spots.error_px)
 
 
 def frame_stack(frames: ArrayLike, layout: Layout, calibration: Calibration) -> Stack:
@@ -326,8 +322,8 @@ def _learn(
     rng = np.random.default_rng() if rng is None else rng
     n_psfs = int(index.max()) + 1
     batches = [np.arange(i, min(i + _PSFS_AT_ONCE, n_psfs)) for i in range(0, n_psfs, _PSFS_AT_ONCE)]
-    begin = _start_psf(start, stack, n_psfs, options)
-    shared_rounds = _SHARED_ROUNDS if len(begin.samples) < n_psfs else 0
+    shared = Learning(stack, np.zeros_like(index), _start_psf(start, stack, n_psfs, options), options)
+    shared_rounds = _SHARED_ROUNDS if len(shared.psf.samples) < n_psfs else 0
     total, done = shared_rounds + options.rounds * len(batches), 0
 
     def advance() -> None:
@@ -336,44 +332,18 @@ def _learn(
         if progress is not None:
             progress(done / total)
 
-    state = State(begin, np.zeros(len(begin.samples)))
     if shared_rounds:
-        shared = replace(options, rounds=shared_rounds)
-        state = learn(stack, np.zeros_like(index), state, shared, rng, advance)
-    learnt = []
-    for batch in batches:
-        spots = np.flatnonzero((index >= batch[0]) & (index <= batch[-1]))
-        if spots.size == 0:
-            raise InputError(f"index: expected spots for each PSF, got none for {batch[0]} to {batch[-1]}")
-        part = _batch(state, batch, spots)
-        learnt.append((spots, learn(stack.part(spots), index[spots] - batch[0], part, options, rng, advance)))
-    return _joined(learnt, index, options)
-
-
-def _batch(state: State, batch: NDArray[np.int64], spots: NDArray[np.int64]) -> State:
-    """The PSFs and spots of one batch; where there is one PSF so far, every one begins with it."""
-    first = batch if len(state.psf.samples) > 1 else np.zeros_like(batch)
-    batch_spots = None if state.spots is None else state.spots.part(spots)
-    psf = psf_of(state.psf.samples[first], state.psf.oversampling)
-    return State(psf, state.background_e[first], state.form, batch_spots)
-
-
-def _joined(
-    learnt: list[tuple[NDArray[np.int64], State]], index: NDArray[np.int64], options: LearningOptions
-) -> LearntPSF:
-    """Put the batches together."""
-    order = np.argsort(np.concatenate([index for index, _ in learnt]))
-    measured = [state.spots for _, state in learnt if state.spots is not None]
-    spots = Registered.joined(measured).part(order)
+        shared.learn(shared_rounds, rng, advance)
+    learnt = [shared.part(batch, index) for batch in batches]
+    for part in learnt:
+        part.learn(options.rounds, rng, advance)
+    # Spots by their batch, each in order.
+    order = np.argsort(np.argsort(index // _PSFS_AT_ONCE, kind="stable"))
+    spots = Registered.joined([not_none(part.spots) for part in learnt]).part(order)
     check_phases(index, spots)
-    samples = np.concatenate([state.psf.samples for _, state in learnt])
-    return LearntPSF(
-        psf_of(samples, options.oversampling),
-        np.concatenate([state.background_e for _, state in learnt]),
-        spots.positions,
-        spots.flux_e,
-        spots.error_px,
-    )
+    psf = psf_of(np.concatenate([part.psf.samples for part in learnt]), options.oversampling)
+    background_e = np.concatenate([part.background_e for part in learnt])
+    return LearntPSF(psf, background_e, spots.positions, spots.flux_e, spots.error_px)
 
 
 def _start_psf(start: PSF | float | None, stack: Stack, n_psfs: int, options: LearningOptions) -> PSF:

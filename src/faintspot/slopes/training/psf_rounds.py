@@ -1,15 +1,15 @@
 """Learning PSFs round by round: register every spot with the PSF so far, stack, fit, again."""
 
+from __future__ import annotations
+
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
-from faintspot.base.checks import not_none
 from faintspot.base.errors import InputError
 from faintspot.base.flags import KEEPABLE, SubapertureFlag, leave_out
 from faintspot.slopes.camera.calibration import Calibration
@@ -19,9 +19,10 @@ from faintspot.slopes.pipeline.settings import Settings
 from faintspot.slopes.pipeline.slope_pipeline import SlopePipeline
 from faintspot.slopes.sensor.layout import Layout
 from faintspot.slopes.spots.psf import PSF
-from faintspot.slopes.training.psf_fit import FIRST_FORM, Form, choose_form, fit_psf, samples_of
+from faintspot.slopes.training.psf_fit import FIRST_FORM, choose_form, fit_psf, samples_of
 from faintspot.slopes.training.registration import (
     Floats,
+    Integers,
     PSFTables,
     Registered,
     Stack,
@@ -53,16 +54,6 @@ class LearningOptions:
     search_px: float
 
 
-@dataclass(frozen=True)
-class State:
-    """PSFs, the background of each (electrons per pixel), how freely they follow the data, and the spots."""
-
-    psf: PSF
-    background_e: Floats
-    form: Form = FIRST_FORM
-    spots: Registered | None = None
-
-
 def gaussian_psf(fwhm_px: float, options: LearningOptions) -> PSF:
     """Return a round Gaussian PSF, pixels included."""
     std = np.hypot(fwhm_px / 2.3548, 1 / np.sqrt(12))
@@ -83,46 +74,100 @@ def measured_width(stack: Stack) -> float:
     return max(_START_WIDTHS_PX, key=response)
 
 
-def learn(
-    stack: Stack,
-    index: NDArray[np.int64],
-    state: State,
-    options: LearningOptions,
-    rng: np.random.Generator,
-    progress: Callable[[], object],
-) -> State:
-    """Return the PSFs of the spots after all rounds; `index` says which PSF each spot has.
+class Learning:
+    """PSFs that are learnt round by round from spots, with the background of each.
 
-    Raises
-    ------
-    InputError
-        When too few spots are bright enough.
+    Parameters
+    ----------
+    stack : Stack
+    index : (n,) array of int
+        PSF of each spot.
+    psf : PSF
+        PSFs to begin with.
+    options : LearningOptions
     """
-    halves = rng.permutation(len(index)) % 2 == 0
-    draws = -(-_DRAWN_SPOTS // len(index))
-    for number in range(options.rounds):
-        state = registered(stack, index, state, options)
-        to_come = options.rounds - 1 - number
-        sums, count = stacked(stack, index, state, halves, draws, options, rng)
-        if count.sum() < FEWEST_SPOTS:
-            raise InputError(
-                f"images: expected at least {FEWEST_SPOTS} spots whose position can be measured to "
-                f"{_LARGEST_ERROR_PX:g} px, got {count.sum()} of {len(index)}"
-            )
-        state = refitted(sums, count, state, 0 < to_come <= _CHOICES, options, rng)
-        progress()
-    return state
 
+    def __init__(self, stack: Stack, index: Integers, psf: PSF, options: LearningOptions) -> None:
+        self.stack, self.index, self.psf, self.options = stack, index, psf, options
+        self.background_e = np.zeros(len(psf.samples))
+        """Electrons per pixel, for each PSF."""
+        self.form = FIRST_FORM
+        self.spots: Registered | None = None
 
-def registered(stack: Stack, index: NDArray[np.int64], state: State, options: LearningOptions) -> State:
-    """Return the state with the spots measured anew."""
-    tables = PSFTables.of(state.psf, options.radius_px)
-    images = stack.without(state.background_e[index])
-    spots, steps = state.spots, _LATER_STEPS
-    if spots is None:
-        spots, steps = start(images, tables, index, state.psf.fwhm_px, options.search_px), _START_STEPS
-    spots = register(images, tables, index, spots, options.search_px, steps)
-    return State(state.psf, state.background_e, state.form, spots)
+    def part(self, batch: Integers, index: Integers) -> Learning:
+        """Return the learning of a batch of PSFs; where there is one PSF so far, every one begins with it.
+
+        Parameters
+        ----------
+        batch : (n_psfs,) array of int
+        index : (n,) array of int
+            PSF of each spot.
+        """
+        first = batch if len(self.psf.samples) > 1 else np.zeros_like(batch)
+        chosen = np.flatnonzero((index >= batch[0]) & (index <= batch[-1]))
+        if chosen.size == 0:
+            raise InputError(f"index: expected spots for each PSF, got none for {batch[0]} to {batch[-1]}")
+        psf = psf_of(self.psf.samples[first], self.psf.oversampling)
+        part = Learning(self.stack.part(chosen), index[chosen] - batch[0], psf, self.options)
+        part.background_e, part.form = self.background_e[first], self.form
+        part.spots = None if self.spots is None else self.spots.part(chosen)
+        return part
+
+    def learn(self, rounds: int, rng: np.random.Generator, progress: Callable[[], object]) -> None:
+        """Register the spots and fit the PSFs, that many times.
+
+        Raises
+        ------
+        InputError
+            When too few spots are bright enough.
+        """
+        halves = rng.permutation(len(self.index)) % 2 == 0
+        draws = -(-_DRAWN_SPOTS // len(self.index))
+        for to_come in reversed(range(rounds)):
+            spots, tables = self.register()
+            good = bright_enough(spots)
+            if good.sum() < FEWEST_SPOTS:
+                raise InputError(
+                    f"images: expected at least {FEWEST_SPOTS} spots whose position can be measured to "
+                    f"{_LARGEST_ERROR_PX:g} px, got {good.sum()} of {len(good)}"
+                )
+            stack, index, spots = self.stack.part(good), self.index[good], spots.part(good)
+            sums = stack_spots(stack, tables, index, spots, self.background_e, halves[good], draws, rng)
+            count = np.bincount(index, minlength=len(sums))
+            if 0 < to_come <= _CHOICES:
+                self._choose_form(sums, count, rng)
+            self._refit(tables, sums, count)
+            progress()
+
+    def register(self) -> tuple[Registered, PSFTables]:
+        """Measure the spots anew; return them and the tables of the PSFs."""
+        tables, search_px = PSFTables.of(self.psf, self.options.radius_px), self.options.search_px
+        images = self.stack.without(self.background_e[self.index])
+        spots, steps = self.spots, _LATER_STEPS
+        if spots is None:
+            spots, steps = start(images, tables, self.index, self.psf.fwhm_px, search_px), _START_STEPS
+        self.spots = register(images, tables, self.index, spots, search_px, steps)
+        return self.spots, tables
+
+    def _choose_form(self, sums: list[tuple[Sums, Sums]], count: Integers, rng: np.random.Generator) -> None:
+        """Choose how freely the PSFs follow the data, from some with enough spots."""
+        enough = np.flatnonzero(count >= FEWEST_SPOTS)
+        if enough.size:
+            compared = rng.permutation(enough)[:_PSFS_COMPARED]
+            n_spots = float(count[compared].sum())
+            self.form = choose_form([sums[i] for i in compared], n_spots, self.options.radius_px)
+
+    def _refit(self, tables: PSFTables, sums: list[tuple[Sums, Sums]], count: Integers) -> None:
+        """Fit the PSFs to the sums of so many spots each; one with too few spots stays unchanged."""
+        options, samples = self.options, []
+        for i, (first, second) in enumerate(sums):
+            plane: Floats = tables.value[i].astype(np.float64)
+            if count[i] >= FEWEST_SPOTS:
+                fit = fit_psf(first.combined(second), self.form, options.radius_px)
+                if fit.plane.sum() > 0:
+                    plane, self.background_e[i] = fit
+            samples.append(samples_of(plane, options.radius_px, options.oversampling))
+        self.psf = psf_of(np.stack(samples), options.oversampling)
 
 
 def bright_enough(spots: Registered) -> NDArray[np.bool_]:
@@ -130,63 +175,12 @@ def bright_enough(spots: Registered) -> NDArray[np.bool_]:
     return np.all(spots.error_px < _LARGEST_ERROR_PX, axis=1)  # type: ignore[no-any-return]
 
 
-def stacked(
-    stack: Stack,
-    index: NDArray[np.int64],
-    state: State,
-    halves: NDArray[np.bool_],
-    draws: int,
-    options: LearningOptions,
-    rng: np.random.Generator,
-) -> tuple[list[tuple[Sums, Sums]], NDArray[np.int64]]:
-    """Return the sums of both halves of each PSF's spots, and how many spots are in them."""
-    spots = not_none(state.spots)
-    good = bright_enough(spots)
-    count = np.bincount(index[good], minlength=len(state.psf.samples))
-    sums = stack_spots(
-        stack.part(good),
-        PSFTables.of(state.psf, options.radius_px),
-        index[good],
-        spots.part(good),
-        state.background_e,
-        halves[good],
-        draws,
-        rng,
-    )
-    return sums, count
-
-
-def refitted(
-    sums: list[tuple[Sums, Sums]],
-    count: NDArray[np.number[Any]],
-    state: State,
-    choose: bool,
-    options: LearningOptions,
-    rng: np.random.Generator,
-) -> State:
-    """Return the state with the PSFs fitted to the sums; a PSF with too few spots stays unchanged."""
-    enough = count >= FEWEST_SPOTS
-    form = state.form
-    if choose and enough.any():
-        compared = rng.permutation(np.flatnonzero(enough))[:_PSFS_COMPARED]
-        form = choose_form([sums[i] for i in compared], float(count[compared].sum()), options.radius_px)
-    before = PSFTables.of(state.psf, options.radius_px).value.astype(np.float64)
-    samples, background = [], state.background_e.copy()
-    for i, (first, second) in enumerate(sums):
-        plane = before[i]
-        fit = fit_psf(first.combined(second), form, options.radius_px) if enough[i] else None
-        if fit is not None and fit.plane.sum() > 0:
-            plane, background[i] = fit
-        samples.append(samples_of(plane, options.radius_px, options.oversampling))
-    return State(psf_of(np.stack(samples), options.oversampling), background, form, state.spots)
-
-
 def psf_of(samples: Floats, oversampling: int) -> PSF:
     """Return the PSFs with these samples."""
     return PSF(samples, oversampling, np.arange(len(samples)) if len(samples) > 1 else None)
 
 
-def check_phases(index: NDArray[np.int64], spots: Registered) -> None:
+def check_phases(index: Integers, spots: Registered) -> None:
     """Warn when spots lie at too few sub-pixel phases for the PSF between the pixels to be seen.
 
     Their spread follows from the phases' mean resultant length, with the part of it taken out that errors of

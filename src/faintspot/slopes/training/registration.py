@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -43,12 +43,12 @@ class Stack:
         if self.usable is not None:
             images *= self.usable
         noise = self.excess_noise * max(float(background_e.mean()), 0.0)
-        return Stack(images, self.usable, self.variance_e2 + noise, self.excess_noise)
+        return replace(self, images=images, variance_e2=self.variance_e2 + noise)
 
     def part(self, chosen: Any) -> Stack:
         """Return some of the spots."""
         usable = None if self.usable is None else self.usable[chosen]
-        return Stack(self.images[chosen], usable, self.variance_e2, self.excess_noise)
+        return replace(self, images=self.images[chosen], usable=usable)
 
     def blocks(self) -> Iterator[slice]:
         """Yield blocks of spots whose temporary arrays are small."""
@@ -215,36 +215,24 @@ class Sums:
     Cells are the nodes of the fine grid, (side, side).
     """
 
-    square: Floats
-    """Sum of weight * flux^2."""
-    cross: Floats
-    """Sum of weight * flux."""
-    product: Floats
-    """Sum of weight * flux * image."""
-    weight: float = 0.0
+    planes: Floats
+    """Sums of weight * flux^2, weight * flux and weight * flux * image, (3, side, side)."""
+    weight: float
     """Sum of weight over all pixels, those outside the grid too."""
-    image: float = 0.0
+    image: float
     """Sum of weight * image."""
 
     def combined(self, other: Sums) -> Sums:
         """Return these sums plus another's."""
-        return Sums(
-            self.square + other.square,
-            self.cross + other.cross,
-            self.product + other.product,
-            self.weight + other.weight,
-            self.image + other.image,
-        )
+        return Sums(self.planes + other.planes, self.weight + other.weight, self.image + other.image)
 
-    def folded(self, transform: Any) -> Sums:
-        """Return the sums with those of a symmetric image of the grid added: half of each."""
-        halves = np.stack([0.5 * (plane + transform(plane)) for plane in self.planes])
-        return Sums(halves[0], halves[1], halves[2], self.weight, self.image)
+    def transposed(self) -> Sums:
+        """Return the sums with rows and columns exchanged."""
+        return replace(self, planes=self.planes.swapaxes(1, 2))
 
-    @property
-    def planes(self) -> tuple[Floats, Floats, Floats]:
-        """The three sums over cells."""
-        return self.square, self.cross, self.product
+    def folded(self, symmetric: Floats) -> Sums:
+        """Return the mean of these sums and `symmetric`, those of a symmetric image of the grid."""
+        return replace(self, planes=0.5 * (self.planes + symmetric))
 
 
 def stack_spots(
@@ -284,7 +272,7 @@ def stack_spots(
                 scalars[row] += np.bincount(group, values.sum(axis=(1, 2)), 2 * n_psfs)
     planes = sums.reshape(3, 2 * n_psfs, side, side)
     planes[:, :, [0, -1], :] = planes[:, :, :, [0, -1]] = 0  # pixels outside the grid
-    halves_of = [Sums(*planes[:, i], *scalars[:, i]) for i in range(2 * n_psfs)]
+    halves_of = [Sums(planes[:, i], *scalars[:, i]) for i in range(2 * n_psfs)]
     return list(zip(halves_of[::2], halves_of[1::2], strict=True))
 
 
