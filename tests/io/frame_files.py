@@ -1,4 +1,4 @@
-"""Files of frames in every format: the subjects of `FrameFormatTests`."""
+"""Files of frames in every format."""
 
 from collections.abc import Callable
 from dataclasses import dataclass

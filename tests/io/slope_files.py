@@ -1,4 +1,4 @@
-"""Slopes to be written and checked, and the formats that `SlopeFormatTests` runs through."""
+"""Slopes to be written and checked, and the formats that are tested."""
 
 from collections.abc import Mapping
 from pathlib import Path

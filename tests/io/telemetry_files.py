@@ -7,19 +7,15 @@ import numpy as np
 from faintspot.io.telemetry import item_type
 
 N, SHAPE, WINDOW = 8, (24, 24), (8, 8)
+CELLS = [[row, column] for row in range(3) for column in range(3) if (row, column) != (1, 1)]
 ATTRIBUTES: dict[str, Any] = {
     "name": "bench",
     "layout": {
         "frame_shape": SHAPE,
         "window": WINDOW,
-        "corners": [[row, column] for row in (0, 8, 16) for column in (0, 8, 16) if (row, column) != (8, 8)],
-        "centres": [
-            [column + 3.75, row + 3.5]
-            for row in (0, 8, 16)
-            for column in (0, 8, 16)
-            if (row, column) != (8, 8)
-        ],
-        "cells": [[row, column] for row in range(3) for column in range(3) if (row, column) != (1, 1)],
+        "corners": [[8 * row, 8 * column] for row, column in CELLS],
+        "centres": [[8 * column + 3.75, 8 * row + 3.5] for row, column in CELLS],
+        "cells": CELLS,
     },
     "settings": '[estimator]\nname = "tv"\nnoise_std = 1.5\n[settings]\nflux_e = 30.0\n',
     "methods": ["none", "tv"],

@@ -176,13 +176,8 @@ def with_subapertures(system: Any) -> None:
 
 def test_the_example_of_aotpy(tmp_path: Path) -> None:
     sensor: Any = read_aot(example(tmp_path / "e.fits"))  # that with pixels
-    assert (sensor.name, sensor.n, sensor.pixels, sensor.layout, sensor.tables) == (
-        "WFS1",
-        4,
-        "PIXELS",
-        None,
-        {},
-    )
+    assert (sensor.name, sensor.n, sensor.pixels) == ("WFS1", 4, "PIXELS")
+    assert (sensor.layout, sensor.tables) == (None, {})
     assert (sensor.slopes.shape, sensor.unit, sensor.frame.size) == ((50, 2, 4), "", 0)
     other = read_aot(tmp_path / "e.fits", "WFS2")
     assert repr(other) == "AotSensor('WFS2', 8 sub-apertures, slopes)"
@@ -190,9 +185,9 @@ def test_the_example_of_aotpy(tmp_path: Path) -> None:
         assert (frames.n_frames, frames.shape) == (10, (20, 20))
     with open_frames([f"{tmp_path}/e.fits:SLOPES 4"]) as frames:
         assert frames.shape == (2, 4)
-    with pytest.raises(fs.InputError, match=r"e\.fits: sensor 'WFS1'.*\[layout\] in .*none\.toml"):
+    with refused("e.fits: sensor 'WFS1'", "[layout] in ", "none.toml"):
         measure_recorded([tmp_path / "e.fits"], tmp_path / "none.toml", tmp_path / "s.npz")
-    with pytest.raises(fs.InputError, match=r"'WFS2': expected frames \(pixel_intensities"):
+    with refused("'WFS2': expected frames (pixel_intensities"):
         open_frames([tmp_path / "e.fits"], key="WFS2")
 
 
@@ -219,11 +214,6 @@ def test_subapertures_of_others(tmp_path: Path) -> None:
     assert sensor.interaction.shape == (8, 3)
     assert sensor.interaction[1].tolist() == [6.0, 7.0, 8.0]  # x of the second
     assert sensor.interaction[4].tolist() == [3.0, 4.0, 5.0]  # y of the first
-    fs.Settings("centroid").save(tmp_path / "faintspot.toml")
-    measure_recorded([tmp_path / "e.fits"], tmp_path / "faintspot.toml", tmp_path / "s.npz")
-    with open_frames([tmp_path / "e.fits"]) as frames:
-        pipeline = fs.SlopePipeline(layout, fs.Settings("centroid"), reference=sensor.reference)
-        assert np.array_equal(read_slopes(tmp_path / "s.npz").variables["y"], pipeline(frames.block(0, 10)).y)
 
 
 @pytest.mark.filterwarnings("ignore::faintspot.base.errors.DoubtWarning")
@@ -271,37 +261,22 @@ MASK = np.array([[7, 2, -1], [0, -1, 1], [-1, 3, -1]])
         (changed("sensor.detector", None), "one Shack-Hartmann sensor with pixels, it has: WFS1, WFS2"),
         (pyramid, "it has: none"),
         (changed("sensor.subaperture_mask.data", MASK), "subaperture_mask: expected the numbers 0 to 3"),
-        (
-            changed("sensor.ref_measurements.data", np.zeros((4, 2))),
-            r"ref_measurements: expected shape \(2, 4\), got \(4, 2\)",
-        ),
-        (
-            changed("sensor.measurements.data", np.ones((50, 4, 2))),
-            r"measurements: expected shape \(t, 2, 4\)",
-        ),
-        (
-            changed("loop.interaction_matrix.data", np.ones((3, 2, 4))),
-            r"interaction_matrix: expected shape \(4, 2, commands\), got \(3, 2, 4\)",
-        ),
-        (
-            changed("sensor.mask_offsets", 2 * [aotpy.Coordinates(2.0, 1.0)]),
-            "mask_offsets: expected one, got 2",
-        ),
-        (
-            changed("sensor.detector.pixel_intensities.data", np.ones(20)),
-            r"pixel_intensities: expected \(frames, height, width\)",
-        ),
+        (changed("sensor.ref_measurements.data", np.zeros((4, 2))), "expected shape (2, 4), got (4, 2)"),
+        (changed("sensor.measurements.data", np.ones((50, 4, 2))), "measurements: expected shape (t, 2, 4)"),
+        (changed("loop.interaction_matrix.data", np.ones((3, 2, 4))), "expected shape (4, 2, commands)"),
+        (changed("sensor.mask_offsets", 2 * [aotpy.Coordinates(2.0, 1.0)]), "expected one, got 2"),
+        (changed("sensor.detector.pixel_intensities.data", np.ones(20)), "(frames, height, width)"),
     ],
 )
 def test_damaged_files_are_refused(tmp_path: Path, change: Callable[[Any], None], naming: str) -> None:
-    with refused(match=naming):
+    with refused(naming):
         read_aot(example(tmp_path / "e.fits", change))
 
 
 def test_subapertures_outside_the_frame_are_refused(tmp_path: Path) -> None:
     fs.Settings("centroid").save(tmp_path / "faintspot.toml")
     path = example(tmp_path / "e.fits", changed("sensor.mask_offsets", [aotpy.Coordinates(5.0, 1.0)]))
-    with pytest.raises(fs.InputError, match=r"'WFS1': layout: sub-aperture 1 .* leaves the frame"):
+    with refused("'WFS1': layout: sub-aperture 1 ", "leaves the frame"):
         measure_recorded([path], tmp_path / "faintspot.toml", tmp_path / "s.npz")
 
 
@@ -322,18 +297,16 @@ def test_images_elsewhere_are_not_fetched(tmp_path: Path) -> None:
 
 
 def test_what_is_no_aot_file(tmp_path: Path) -> None:
-    with pytest.raises(fs.InputError, match="no such file"):
-        read_aot(tmp_path / "absent.fits")
+    content = example(tmp_path / "e.fits").read_bytes()
     (tmp_path / "text.fits").write_text("text")
-    with pytest.raises(fs.InputError, match="AOT-VERS"):
-        read_aot(tmp_path / "text.fits")
-    path = example(tmp_path / "e.fits")
-    with pytest.raises(fs.InputError, match="a Shack-Hartmann sensor 'WFS7', it has: WFS1, WFS2"):
-        read_aot(path, "WFS7")
-    content = path.read_bytes()
-    path.write_bytes(content.replace(b"AOT_SOURCES", b"AOT_SAUCES "))
-    with refused("not valid"):
-        read_aot(path)
-    path.write_bytes(content[: len(content) // 3])
-    with pytest.raises(fs.InputError, match=r"not valid"):
-        read_aot(path)
+    (tmp_path / "unknown.fits").write_bytes(content.replace(b"AOT_SOURCES", b"AOT_SAUCES "))
+    (tmp_path / "cut.fits").write_bytes(content[: len(content) // 3])
+    for name, sensor, words in (
+        ("absent", None, "no such file"),
+        ("text", None, "AOT-VERS"),
+        ("e", "WFS7", "a Shack-Hartmann sensor 'WFS7', it has: WFS1, WFS2"),
+        ("unknown", None, "not valid"),
+        ("cut", None, "not valid"),
+    ):
+        with refused(words):
+            read_aot(tmp_path / f"{name}.fits", sensor)

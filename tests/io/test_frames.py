@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
-from tests.io.frame_files import cube, save, zarr
+from tests.io.frame_files import cube, h5py, save, zarr
 from tests.refusals import refused
 
 from faintspot.io import open_frames, read_array, read_slopes
@@ -107,7 +107,11 @@ def test_several_arrays_are_listed(tmp_path: Path) -> None:
     group = zarr.create_group(str(tmp_path / "a.zarr"))
     group.create_array("one", data=cube())
     group.create_array("two", data=cube())
-    for path in (tmp_path / "a.npz", tmp_path / "a.zarr"):
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["one"], file["two"], file["group/flat"] = cube(), cube(), np.ones(3)
+    with refused("no array 'group'"):
+        open_frames([f"{tmp_path / 'a.h5'}:group"])
+    for path in (tmp_path / "a.npz", tmp_path / "a.zarr", tmp_path / "a.h5"):
         with refused(path.name, "one", "two", f"{path.name}:NAME"):
             open_frames([path])
         with refused(path.name, "three"):

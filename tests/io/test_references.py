@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from tests.io.slope_files import ATTRIBUTES, begin, part, result, write
+from tests.refusals import refused
 
-from faintspot.base.errors import InputError
 from faintspot.io.slopes import read_reference
 
 fits = pytest.importorskip("astropy.io.fits")
@@ -15,12 +15,8 @@ zarr = pytest.importorskip("zarr")
 def means() -> NDArray[np.float64]:
     """Mean of the valid slopes of each sub-aperture, one by one."""
     slopes = result()
-    return np.array(
-        [
-            [slopes[name][slopes["valid"][:, i], i].astype(np.float64).mean() for name in ("x", "y")]
-            for i in range(7)
-        ]
-    )
+    columns = [(slopes["valid"][:, i], i) for i in range(7)]
+    return np.array([[slopes[name][column].mean(dtype=np.float64) for name in "xy"] for column in columns])
 
 
 @pytest.mark.parametrize("shape", [(7, 2), (14,)])
@@ -40,9 +36,7 @@ def test_where_nothing_is_valid(tmp_path: Path) -> None:
     np.testing.assert_allclose(read_reference(tmp_path / "a.npz"), expected, rtol=1e-12)
     slopes["valid"][:] = False
     write(tmp_path / "b.npz", slopes)
-    with pytest.raises(
-        InputError, match=r"b\.npz: expected valid slopes to take as reference, found none \("
-    ):
+    with refused("b.npz: expected valid slopes to take as reference, found none ("):
         read_reference(tmp_path / "b.npz")
 
 
@@ -53,10 +47,9 @@ def test_unfinished_store_gives_the_mean_so_far(tmp_path: Path) -> None:
     assert read_reference(tmp_path / "a.zarr")[0, 0] == pytest.approx(mean, rel=1e-12)
 
 
-@pytest.mark.parametrize("shape", [(7, 2), (14,)])
 @pytest.mark.parametrize("name", ["a.npy", "a.npz", "a.npz:one", "a.fits", "a.fits.gz", "a.zarr"])
-def test_arrays_are_read_from_every_format(tmp_path: Path, name: str, shape: tuple[int, ...]) -> None:
-    array = np.random.default_rng(2).normal(size=shape)
+def test_arrays_are_read_from_every_format(tmp_path: Path, name: str) -> None:
+    array = np.random.default_rng(2).normal(size=(7, 2))
     path = tmp_path / name.partition(":")[0]
     if ".fits" in name:
         fits.PrimaryHDU(array).writeto(path)
@@ -71,7 +64,7 @@ def test_arrays_are_read_from_every_format(tmp_path: Path, name: str, shape: tup
 
 @pytest.mark.parametrize("name", ["a" * 5000, "a\0b", "a\0b:frames"])
 def test_names_that_no_file_can_have(name: str) -> None:
-    with pytest.raises(InputError, match="no such file"):
+    with refused("no such file"):
         read_reference(name)
 
 
@@ -80,5 +73,5 @@ def test_a_damaged_archive(tmp_path: Path) -> None:
     write(path, result())
     content = path.read_bytes()
     path.write_bytes(content.replace(b"PK\x01\x02", b"PK\x01\x03"))  # the list of what is in it
-    with pytest.raises(InputError, match=r"flat\.npz"):
+    with refused("flat.npz"):
         read_reference(path)

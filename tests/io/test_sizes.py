@@ -15,7 +15,6 @@ from tests import refusals
 from tests.io.frame_files import fits, h5py, tifffile, zarr
 from tests.io.slope_files import result, write
 
-from faintspot.base.files import read_arrays
 from faintspot.io import file_format, open_frames, read_array, read_slopes
 from faintspot.io.fits_units import units_of
 from faintspot.io.slopes import read_reference
@@ -33,7 +32,7 @@ def small_limits(monkeypatch: pytest.MonkeyPatch) -> None:
     """Limits of 8 MiB, so that files that exceed them are made quickly."""
     for module in ("frames", "stored_array", "zarr_store", "fits_units"):
         monkeypatch.setattr(f"faintspot.io.{module}.MOST_WHOLE_BYTES", 8 * MIB)
-    monkeypatch.setattr(read_arrays, "__defaults__", (None, (), 8 * MIB))
+    monkeypatch.setattr("faintspot.base.files.MOST_BYTES", 8 * MIB)
     monkeypatch.setattr(file_format, "memory_bytes", lambda: 16 * MIB)
 
 
@@ -52,7 +51,6 @@ def refused(*words: str) -> Iterator[None]:
 READERS: list[tuple[str, Callable[[Path], Any]]] = [
     ("samples", PSF.load),
     ("frames", read_array),
-    ("frames", lambda path: read_arrays(path, "a PSF", most=8 * MIB)),
     ("x", read_slopes),
     ("x", read_reference),
 ]

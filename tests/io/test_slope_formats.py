@@ -1,188 +1,373 @@
-import sys
+"""What every format of slopes must do."""
+
+import errno
+import os
+import shutil
 import tracemalloc
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
 from tests.io.slope_files import (
     ATTRIBUTES,
     NAMES,
+    OTHER_RUN,
     assert_alone,
     assert_refused,
+    assert_stored,
     begin,
+    part,
     result,
+    store_of,
     write,
     writer_for,
 )
-from tests.io.slope_format_tests import SlopeFormatTests, SlopeStoreTests
 from tests.refusals import refused
 
-from faintspot.base.errors import MissingExtraError
-from faintspot.base.flags import VARIABLES
-from faintspot.io import file_format, read_slopes
-from faintspot.io.formats import csv_files
+from faintspot.base import files
+from faintspot.base.errors import InputError
+from faintspot.base.flags import VARIABLES, Variable
+from faintspot.io import read_slopes, slopes_writer, zarr_store
+from faintspot.io.formats import zarr_files
 
-fits = pytest.importorskip("astropy.io.fits")
+CHANGED = {**result(), "x": result()["y"]}
 
 
-class TestEveryFormat(SlopeFormatTests):
+@pytest.fixture
+def path(tmp_path: Path, name: str) -> Path:
+    return tmp_path / name
+
+
+@pytest.fixture
+def is_store(path: Path) -> bool:
+    return store_of(path) == path
+
+
+@pytest.fixture(autouse=True)
+def small_chunks(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ten frames of seven sub-apertures a chunk."""
+    monkeypatch.setattr(zarr_files, "_CHUNK_NUMBERS", 70)
+
+
+@pytest.fixture
+def all_marks(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A mark after every chunk."""
+    monkeypatch.setattr(slopes_writer, "_MARK_SECONDS", 0.0)
+
+
+class TestEveryFormat:
     @pytest.fixture(params=NAMES)
     def name(self, request: pytest.FixtureRequest) -> str:
         return str(request.param)
 
+    # Content ----------------------------------------------------------------------------------------
 
-class TestStore(SlopeStoreTests):
+    def test_gives_back_what_it_got(self, path: Path) -> None:
+        write(path, result(), 8)
+        assert_alone(path, result())
+
+    def test_equal_slopes_give_equal_files(self, path: Path, is_store: bool) -> None:
+        if is_store:
+            return
+        write(path, result())
+        content = path.read_bytes()
+        write(path, result(), overwrite=True)
+        assert path.read_bytes() == content
+
+    def test_standard_errors_that_are_not_given_are_infinite(self, path: Path) -> None:
+        errors = ("standard_error_x", "standard_error_y")
+        write(path, {name: values for name, values in result().items() if name not in errors})
+        unknown = np.full((50, 7), np.inf, np.float32)
+        assert_stored(path, {**result(), **dict.fromkeys(errors, unknown)})
+
+    def test_a_file_without_covariances_is_read(self, path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        whole = result()
+        covariance = whole.pop("covariance_xy")
+        with monkeypatch.context() as before:
+            before.delitem(cast("dict[str, Variable]", VARIABLES), "covariance_xy")
+            write(path, whole)
+        assert_stored(path, {**whole, "covariance_xy": np.zeros_like(covariance)})
+
+    def test_memory_does_not_grow_with_the_run(self, path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        """While 24 MB of slopes are written; measuring texts takes too long."""
+        if path.suffix == ".csv":
+            return
+        monkeypatch.setattr(zarr_files, "_CHUNK_NUMBERS", 1 << 16)
+        block = result(100, 200)
+        with writer_for(path.with_name(f"first_{path.name}"), 100, 200) as writer:  # imports and codecs
+            writer.append(0, block)
+        tracemalloc.start()
+        try:
+            with writer_for(path, 4000, 200) as writer:
+                for start in range(0, 4000, 100):
+                    writer.append(start, block)
+            assert tracemalloc.get_traced_memory()[1] < 18_000_000  # blocks, chunks, buffers
+        finally:
+            tracemalloc.stop()
+
+    # Interruptions ----------------------------------------------------------------------------------
+
+    def test_interrupted_and_resumed_is_the_same(self, path: Path, is_store: bool) -> None:
+        def interrupted() -> None:
+            with writer_for(path) as writer:
+                writer.append(0, part(result(), 0, 13))
+                raise KeyboardInterrupt
+
+        with pytest.raises(KeyboardInterrupt):
+            interrupted()
+        if not is_store:
+            with refused("no such file; an unfinished run left", str(store_of(path))):
+                read_slopes(path)
+        stored = read_slopes(store_of(path))
+        assert (stored.complete, stored.n_finished) == (False, 13)
+        np.testing.assert_array_equal(stored.variables["flux"], result()["flux"][:13])
+        assert writer_for(path).finished() == 13
+        write(path, result(), 8)
+        assert_alone(path, result())
+
+    def test_file_cannot_be_made(self, path: Path, is_store: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+        if is_store:
+            return
+        synchronise = os.fsync
+
+        def full(descriptor: int) -> None:
+            name = Path(f"/proc/self/fd/{descriptor}").resolve().name
+            if name.startswith(f".{path.name}.") and "zarr" not in name:
+                raise OSError(errno.ENOSPC, "No space left on device")
+            synchronise(descriptor)
+
+        with monkeypatch.context() as patch, refused(path.name, "disk is full"):
+            patch.setattr(os, "fsync", full)
+            write(path, result())
+        assert [entry.name for entry in path.parent.iterdir()] == [store_of(path).name]
+        assert writer_for(path).finished() == 50
+        write(path, result())
+        assert_alone(path, result())
+
+    def test_ended_between_making_the_file_and_removing_the_store(
+        self, path: Path, is_store: bool, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        def end(*_: Any) -> None:
+            raise KeyboardInterrupt
+
+        if is_store:
+            return
+        writer = writer_for(path)
+        writer.append(0, result())
+        with monkeypatch.context() as patch:
+            patch.setattr(slopes_writer, "remove_store", end)
+            with pytest.raises(KeyboardInterrupt):
+                writer.close()
+        assert store_of(path).exists()
+        if path.suffix == ".csv":  # does not identify its run
+            assert_refused(path, "already exists")
+        else:
+            assert writer_for(path).finished() == 50
+            assert_alone(path, result())
+
+    # Existing outputs -------------------------------------------------------------------------------
+
+    def test_other_run(self, path: Path) -> None:
+        begin(path, 8)
+        assert_refused(path, "another run", "--overwrite", attributes=OTHER_RUN)
+        assert_refused(path, "another run", n_frames=51)
+        assert_refused(path, "already exists", resume=False)
+        assert writer_for(path, resume=False, overwrite=True).finished() == 0
+        write(path, result())
+        assert_refused(path, "--overwrite", attributes=OTHER_RUN)
+        assert_refused(path, "already exists", "--overwrite", resume=False)
+        assert_stored(path, result())
+        write(path, CHANGED, overwrite=True)
+        assert_alone(path, CHANGED)
+
+    def test_same_run_that_is_complete(self, path: Path) -> None:
+        write(path, result())
+        if path.suffix == ".csv":
+            assert_refused(path, "already exists")
+            return
+        with writer_for(path) as writer:
+            assert writer.finished() == 50
+            with refused("complete"):
+                writer.append(50, part(result(), 0, 1))
+        assert_alone(path, result())
+
+    def test_old_file_stays_until_the_new_one_is_whole(self, path: Path, is_store: bool) -> None:
+        if is_store:
+            return
+        write(path, result())
+        with writer_for(path, overwrite=True) as writer:
+            writer.append(0, part(CHANGED, 0, 49))
+        assert_stored(path, result())
+        with writer_for(path, overwrite=True) as writer:
+            assert writer.finished() == 49
+            writer.append(49, part(CHANGED, 49, 50))
+        assert_alone(path, CHANGED)
+
+    def test_finished_run_leaves_the_store_of_another_one(self, path: Path, is_store: bool) -> None:
+        if is_store or path.suffix == ".csv":
+            return
+        write(path, result())
+        other: dict[str, Any] = {"attributes": OTHER_RUN, "overwrite": True}
+        begin(path, 8, **other)
+        assert writer_for(path).finished() == 50
+        assert writer_for(path, **other).finished() == 8
+
+    @pytest.mark.parametrize("kind", ["folder", "text"])
+    def test_path_of_something_else(self, path: Path, is_store: bool, kind: str) -> None:
+        if kind == "folder":
+            path.mkdir()
+        else:
+            path.write_text("text")
+        assert_refused(path, path.name, *(["expected slopes"] if is_store else []))
+        with refused(path.name):
+            read_slopes(path)
+        assert path.exists()
+
+    # Other programs and damage ----------------------------------------------------------------------
+
+    def test_one_wrong_bit_anywhere(self, path: Path, is_store: bool) -> None:
+        """Refused, or the slopes that were written: blocks are filled up, and time stamps are not read."""
+        if is_store or path.suffix not in (".npz", ".fits", ".gz"):
+            return
+        write(path, result())
+        content = path.read_bytes()
+        generator = np.random.default_rng(5)
+        messages = []
+        for position in generator.integers(0, len(content), 40):
+            damaged = bytearray(content)
+            damaged[position] ^= 1 << int(generator.integers(8))
+            path.write_bytes(damaged)
+            try:
+                stored = read_slopes(path)
+            except InputError as error:
+                messages.append(str(error))
+                continue
+            for name, values in result().items():
+                np.testing.assert_array_equal(stored.variables[name], values)
+            assert stored.attributes["sources"] == ATTRIBUTES["sources"]
+        assert len(messages) > 20
+        assert all(message.startswith(str(path)) and "\n" not in message for message in messages)
+
+    # Folders ----------------------------------------------------------------------------------------
+
+    def test_missing_folder(self, tmp_path: Path, name: str) -> None:
+        assert_refused(tmp_path / "none" / name, "does not exist")
+
+    @pytest.mark.skipif(os.geteuid() == 0, reason="root may write anywhere")
+    def test_folder_without_permission(self, tmp_path: Path, name: str) -> None:
+        (tmp_path / "locked").mkdir(mode=0o500)
+        assert_refused(tmp_path / "locked" / name, "no permission")
+
+
+class TestStore:
+    """The store that a run writes first, whatever its format."""
+
     @pytest.fixture(params=["slopes.zarr", "slopes.npz"])
     def name(self, request: pytest.FixtureRequest) -> str:
         return str(request.param)
 
+    @pytest.mark.parametrize("wrong", ["late", "shape", "missing", "many", "none"])
+    def test_wrong_blocks(self, path: Path, wrong: str) -> None:
+        whole = result()
+        start, block, text = {
+            "late": (3, part(whole, 3, 5), "starts at frame 0"),
+            "shape": (0, {**part(whole, 0, 5), "y": whole["y"][:4]}, "y: expected shape"),
+            "missing": (0, {"x": whole["x"]}, "expected x, y, flux"),
+            "many": (0, result(51), "1 to 50 more frames, got 51"),
+            "none": (0, part(whole, 0, 0), "got 0"),
+        }[wrong]
+        with writer_for(path) as writer:
+            with refused(text):
+                writer.append(start, block)
+            assert writer.finished() == 0
 
-def test_xarray_reads_the_store(tmp_path: Path) -> None:
-    """As the README says, without options; a warning is an error in these tests."""
-    xarray = pytest.importorskip("xarray")
-    whole = result()
-    write(tmp_path / "slopes.zarr", whole)
-    with xarray.open_zarr(tmp_path / "slopes.zarr") as dataset:
-        assert dict(dataset.sizes) == {"frame": 50, "subaperture": 7}
-        assert dataset["x"].dims == ("frame", "subaperture")
-        assert set(dataset.coords) == {"centre_x", "centre_y"}
-        assert dataset["x"].attrs["units"] == "px"
-        assert dataset["flux"].attrs["units"] == "e-"
-        assert dataset["centre_x"].attrs["units"] == "px"
-        assert dataset["y"].attrs["long_name"]
-        assert dataset.attrs["configuration"] == ATTRIBUTES["configuration"]
-        assert dataset.attrs["sources"] == ["a.fits", "b.fits"]
-        assert dataset.attrs["complete"] is True
-        for name in VARIABLES:
-            np.testing.assert_array_equal(dataset[name].values, whole[name])
+    @pytest.mark.usefixtures("all_marks")
+    def test_data_are_on_the_disk_before_the_mark(self, path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        """Whatever has content when the mark is set has been synchronised since it was written."""
+        synchronise, replace = files.sync_file, files.replace_file
+        synchronised: dict[str, bytes] = {}
+        missing: list[Mapping[str, bytes]] = []
+        store = store_of(path).name
 
+        def sync_file(file: Path) -> None:
+            synchronised[str(file).replace(f".{store}.new", store)] = file.read_bytes()
+            synchronise(file)
 
-@pytest.mark.parametrize("name", ["slopes.fits", "slopes.fits.gz"])
-def test_astropy_reads_the_fits_file(tmp_path: Path, name: str) -> None:
-    whole = result()
-    write(tmp_path / name, whole)
-    assert_alone(tmp_path / name, whole)
-    if name.endswith(".gz"):  # compressed, and without the time, so that equal slopes give equal files
-        assert (tmp_path / name).read_bytes()[:8] == b"\x1f\x8b\x08\0\0\0\0\0"
-    with fits.open(tmp_path / name, checksum=True) as units:  # a warning is an error
-        units.verify("exception")
-        for unit in units:
-            assert unit.verify_checksum() == unit.verify_datasum() == 1
-        assert units[0].header["NFRAMES"] == 50
-        assert units["X"].header["BUNIT"] == "px"
-        np.testing.assert_array_equal(units["FLUX"].data, whole["flux"])
-        np.testing.assert_array_equal(units["VALID"].data, whole["valid"])
-        assert b"pixels = 16" in units["ATTRIBUTES"].data.tobytes()
+        def replace_file(file: Path, content: str) -> None:
+            chunks = [chunk for chunk in file.parent.rglob("c.*") if chunk.is_file()]
+            now = {str(chunk): chunk.read_bytes() for chunk in chunks}
+            missing.append({chunk: data for chunk, data in now.items() if synchronised.get(chunk) != data})
+            replace(file, content)
 
+        monkeypatch.setattr(zarr_files, "sync_file", sync_file)
+        monkeypatch.setattr(zarr_store, "sync_file", sync_file)
+        monkeypatch.setattr(zarr_store, "replace_file", replace_file)
+        write(path, result(), 10)
+        assert len(missing) >= 5
+        assert not any(missing)
 
-def test_attributes_of_a_finished_output_are_not_measured_again(tmp_path: Path) -> None:
-    calls = []
+    @pytest.mark.usefixtures("all_marks")
+    @pytest.mark.parametrize("marks_before", [0, 4])
+    def test_disk_full_at_a_mark(
+        self, path: Path, is_store: bool, marks_before: int, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        """One line says so, and the run resumes after space is made."""
+        replace = files.replace_file
+        calls = 0
 
-    def measured() -> dict[str, list[float]]:
-        calls.append(1)
-        return {"response": [1.0, 0.5]}
+        def full(file: Path, text: str) -> None:
+            nonlocal calls
+            calls += 1
+            if calls > marks_before:
+                raise OSError(errno.ENOSPC, "No space left on device")
+            replace(file, text)
 
-    for _ in range(2):
-        write(tmp_path / "slopes.npz", result(), measured_attributes=measured)
-        assert read_slopes(tmp_path / "slopes.npz").attributes["response"] == [1.0, 0.5]
-    assert len(calls) == 1
+        with monkeypatch.context() as patch, refused(path.name, "disk is full"):
+            patch.setattr(zarr_store, "replace_file", full)
+            write(path, result(), 10)
+        assert is_store or not path.exists()
+        write(path, result(), 10)
+        assert_alone(path, result())
 
+    @pytest.mark.usefixtures("all_marks")
+    def test_chunk_cannot_be_written(self, path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        from zarr.storage import LocalStore
 
-def test_csv_is_a_plain_table(tmp_path: Path) -> None:
-    whole = result()
-    whole["x"][1, 2] = np.float32(0.1)
-    write(tmp_path / "slopes.csv", whole)
-    lines = (tmp_path / "slopes.csv").read_text().splitlines()
-    assert lines[0] == (
-        "frame,subaperture,x_px,y_px,flux_e,valid,flags,iterations,bad_pixels,"
-        "standard_error_x_px,standard_error_y_px,covariance_xy_px2"
-    )
-    assert len(lines) == 1 + 50 * 7
-    assert lines[1 + 7 + 2].startswith("1,2,0.1,")
+        set_item = LocalStore.set
 
+        async def full(self: Any, key: str, value: Any, *rest: Any) -> None:
+            if key.startswith("iterations/c.2"):
+                raise OSError(errno.ENOSPC, "No space left on device")
+            await set_item(self, key, value, *rest)
 
-def test_csv_is_written_in_pieces(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """As texts the whole table of 1,500 lines takes 1.3 MB, with a piece of 128 lines 0.35 MB."""
-    monkeypatch.setattr(csv_files, "_LINES", 128)
-    tracemalloc.start()
-    try:
-        write(tmp_path / "slopes.csv", result(20, 75), 10)
-        assert tracemalloc.get_traced_memory()[1] < 800_000
-    finally:
-        tracemalloc.stop()
+        with monkeypatch.context() as patch, refused(path.name, "disk is full"):
+            patch.setattr(LocalStore, "set", full)
+            write(path, result(), 10)
+        stored = read_slopes(store_of(path))
+        assert (stored.n_finished, stored.complete) == (20, False)
+        np.testing.assert_array_equal(stored.variables["iterations"], result()["iterations"][:20])
+        write(path, result(), 10)
+        assert_alone(path, result())
 
+    def test_damaged_store(self, path: Path) -> None:
+        begin(path, 13)
+        shutil.rmtree(store_of(path) / "flux")
+        assert_refused(path, "damaged", "delete it", "flux")
+        (store_of(path) / "zarr.json").write_text("{")
+        assert_refused(path, "damaged data", "delete it")
 
-@pytest.mark.parametrize("name", ["flags", "centre_x"])
-@pytest.mark.parametrize("damage", ["lost", "empty", "short", "bit"])
-def test_damaged_chunk_of_a_store(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, damage: str
-) -> None:
-    """Also where all values are 0, which is the fill value."""
-    monkeypatch.setattr("faintspot.io.formats.zarr_files._CHUNK_NUMBERS", 70)
-    whole = result()
-    whole["flags"][20:30] = 0
-    store = tmp_path / "slopes.zarr"
-    write(store, whole)
-    chunk = store / name / ("c.0" if name == "centre_x" else "c.2.0")
-    content = bytearray(chunk.read_bytes())
-    content[5] ^= 4
-    if damage == "lost":
-        chunk.unlink()
-    else:
-        chunk.write_bytes({"empty": bytearray(), "short": content[:9], "bit": content}[damage])
-    with refused(f"{store}: the store is damaged: {name} "):
-        read_slopes(store)
+    def test_damaged_chunk_of_an_interrupted_run(self, path: Path) -> None:
+        begin(path, 13)
+        (store_of(path) / "y" / "c.1.0").write_bytes(b"")
+        assert_refused(path, "the store is damaged: y ")
 
-
-@pytest.mark.parametrize(
-    ("name", "parts", "changes"),
-    [
-        ("slopes.txt", (".zarr", ".fits.gz", ".npz", ".csv"), {}),
-        ("a.npz", ("fingerprint",), {"attributes": {}}),
-        ("a.npz", ("complete",), {"attributes": {"fingerprint": "a", "complete": True}}),
-        ("a.npz", ("object",), {"attributes": {"fingerprint": "a", "what": object()}}),
-        ("a.npz", ("shape (7,)",), {"coordinates": {"centre_x": np.zeros(3)}}),
-        ("a.npz", ("'x'",), {"coordinates": {"x": np.zeros(7)}}),
-        ("a.npz", ("n_frames",), {"n_frames": 0}),
-    ],
-)
-def test_descriptions_that_do_not_fit_are_refused(
-    tmp_path: Path, name: str, parts: tuple[str, ...], changes: Any
-) -> None:
-    assert_refused(tmp_path / name, *parts, **changes)
-    assert not list(tmp_path.iterdir())
-
-
-class TestWithoutZarr:
-    """Slopes are kept in memory, and an interrupted run starts again."""
-
-    @pytest.fixture(autouse=True)
-    def no_package(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        for module in ("zarr", "astropy.io.fits"):
-            monkeypatch.setitem(sys.modules, module, None)
-
-    @pytest.mark.parametrize("name", ["slopes.npz", "slopes.csv"])
-    def test_written_at_the_end(self, tmp_path: Path, name: str) -> None:
-        begin(tmp_path / name, 20)
-        assert not list(tmp_path.iterdir())
-        assert writer_for(tmp_path / name).finished() == 0
-        write(tmp_path / name, result())
-        assert_alone(tmp_path / name, result())
-
-    @pytest.mark.parametrize("name", ["slopes.zarr", "slopes.fits", "slopes.fits.gz"])
-    def test_format_that_needs_a_package(self, tmp_path: Path, name: str) -> None:
-        with pytest.raises(MissingExtraError, match=r"faintspot\[io\]"):
-            writer_for(tmp_path / name)
-        assert not list(tmp_path.iterdir())
-
-    def test_store_that_a_run_with_zarr_left(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.undo()
-        begin(tmp_path / "slopes.npz", 20)
-        monkeypatch.setitem(sys.modules, "zarr", None)
-        with pytest.raises(MissingExtraError, match=r"faintspot\[io\]"):
-            writer_for(tmp_path / "slopes.npz")
-
-    def test_more_than_fits_in_memory(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr(file_format, "memory_bytes", lambda: 20_000)
-        assert_refused(tmp_path / "slopes.npz", "of memory, expected slopes of at most")
+    def test_second_writer_is_refused(self, path: Path) -> None:
+        with writer_for(path) as writer:
+            writer.append(0, part(result(), 0, 20))
+            other_run = {"attributes": OTHER_RUN, "overwrite": True}
+            for changes in ({}, other_run, {"overwrite": True, "resume": False}):
+                assert_refused(path, path.name, f"is being written by process {os.getpid()}", **changes)
+            writer.append(20, part(result(), 20, 50))
+        assert_alone(path, result())

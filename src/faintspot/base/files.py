@@ -234,9 +234,7 @@ MOST_BYTES = 1 << 29
 """Maximum total memory of the arrays of a file."""
 
 
-def unpacked(
-    path: str | Path, what: str, names: Collection[str] | None = None, most: int = MOST_BYTES
-) -> dict[str, Any]:
+def unpacked(path: str | Path, what: str, names: Collection[str] | None, most: int) -> dict[str, Any]:
     """Return the named arrays that exist, or all, if they need at most `most` bytes.
 
     Raises
@@ -271,13 +269,9 @@ def save_arrays(path: str | Path, arrays: Mapping[str, Any]) -> None:
 
 
 def read_arrays(
-    path: str | Path,
-    what: str,
-    names: Sequence[str] | None = None,
-    optional: Sequence[str] = (),
-    most: int = MOST_BYTES,
+    path: str | Path, what: str, names: Sequence[str] | None = None, optional: Sequence[str] = ()
 ) -> dict[str, Any]:
-    """Read the named arrays, or all, from a file that should contain `what` in at most `most` bytes.
+    """Read the named arrays, or all, from a file that should contain `what` in at most `MOST_BYTES`.
 
     Raises
     ------
@@ -285,7 +279,7 @@ def read_arrays(
         If it cannot be read, is too large, or a required array is missing.
     """
     try:
-        values = unpacked(path, what, names, most)
+        values = unpacked(path, what, names, MOST_BYTES)
     except FileNotFoundError:
         raise InputError(f"{path}: no such file") from None
     except InputError:

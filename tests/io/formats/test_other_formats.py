@@ -9,36 +9,21 @@ from PIL import Image
 from tests.io.frame_files import cube, h5py, save, tifffile
 from tests.refusals import refused
 
-from faintspot.base.errors import InputError
 from faintspot.io import open_frames, read_array
 
 
-class TestHdf5:
-    def test_several_data_sets_are_listed(self, tmp_path: Path) -> None:
-        with h5py.File(tmp_path / "a.h5", "w") as file:
-            file["camera/sky"], file["camera/bias"], file["time"] = cube(), cube(3), np.arange(11)
-        with refused("camera/bias, camera/sky, time", "a.h5:NAME"):
-            open_frames([tmp_path / "a.h5"])
-        for key in ("camera/sky", "/camera/sky"):
-            with open_frames([f"{tmp_path / 'a.h5'}:{key}"]) as source:
-                np.testing.assert_array_equal(source.block(2, 9), cube()[2:9])
-        with open_frames([tmp_path / "a.h5"], key="camera/bias") as source:
-            assert source.n_frames == 3
-        with refused("no array 'camera'"):
-            open_frames([f"{tmp_path / 'a.h5'}:camera"])
-
-    def test_numbers_in_other_files_are_not_read(self, tmp_path: Path) -> None:
-        with h5py.File(tmp_path / "a.h5", "w") as file:
-            layout = h5py.VirtualLayout((2, 4, 4), "u1")
-            layout[0] = h5py.VirtualSource("/dev/zero", "x", (4, 4))
-            file.create_virtual_dataset("virtual", layout)
-            file.create_dataset("external", (2, 4, 4), "u1", external=[("/dev/zero", 0, h5py.h5f.UNLIMITED)])
-            file["link"] = h5py.ExternalLink("other.h5", "frames")
-        for name in ("virtual", "external"):
-            with refused("stored in other files"):
-                open_frames([f"{tmp_path}/a.h5:{name}"])
-        with refused("no array 'link'"):
-            open_frames([f"{tmp_path}/a.h5:link"])
+def test_numbers_in_other_files_are_not_read(tmp_path: Path) -> None:
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        layout = h5py.VirtualLayout((2, 4, 4), "u1")
+        layout[0] = h5py.VirtualSource("/dev/zero", "x", (4, 4))
+        file.create_virtual_dataset("virtual", layout)
+        file.create_dataset("external", (2, 4, 4), "u1", external=[("/dev/zero", 0, h5py.h5f.UNLIMITED)])
+        file["link"] = h5py.ExternalLink("other.h5", "frames")
+    for name in ("virtual", "external"):
+        with refused("stored in other files"):
+            open_frames([f"{tmp_path}/a.h5:{name}"])
+    with refused("no array 'link'"):
+        open_frames([f"{tmp_path}/a.h5:link"])
 
 
 class TestMatlab:
@@ -108,8 +93,8 @@ class TestImages:
         with refused("expected a grey image of 8 or 16 bits, got mode P"):
             open_frames([path])
         Image.fromarray(cube(1, 60, 80)[0].astype("u1")).save(path)
-        with pytest.raises(InputError, match="one unnamed"):
+        with refused("one unnamed"):
             open_frames([path], key="frames")
         path.write_bytes(path.read_bytes()[:200])
-        with pytest.raises(InputError, match=r"a\.png: .*damaged"), open_frames([path]) as source:
+        with refused("a.png: ", "damaged"), open_frames([path]) as source:
             source.block(0, 1)

@@ -119,7 +119,7 @@ class Npz(FileFormat):
 
     def read(self, path: Path) -> StoredSlopes:
         """Read a file of slopes; zip verifies the checksum of each array."""
-        arrays = unpacked(path, "slopes", most=most_slopes_bytes())
+        arrays = unpacked(path, "slopes", None, most_slopes_bytes())
         variables = with_absent({name: arrays.pop(name) for name in VARIABLES if name in arrays})
         attributes = parse_json(str(arrays.pop("attributes")))
         return StoredSlopes(variables, arrays, attributes, True, len(variables["x"]))
