@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from tests.refusals import refused
 
-from faintspot.base.errors import InputError
 from faintspot.base.statistics import (
     Estimate,
     absolute_errors,
@@ -40,12 +39,14 @@ def test_float32_positions_do_not_lose_digits_of_the_truth() -> None:
         (np.ones(3), np.ones(3), np.ones(3), "truth: expected shape (3, 2)"),
         (np.ones(3), np.ones(3), np.ones((2, 2)), "truth: expected shape (3, 2)"),
         (np.full(3, np.nan), np.ones(3), np.ones((3, 2)), "x: expected finite numbers"),
+        ([], [], np.ones((0, 2)), "at least one value"),
         (np.ones(3), np.ones(3), np.full((3, 2), np.inf), "truth: expected finite numbers"),
     ],
 )
 def test_positions_of_wrong_shape_are_refused(x: Any, y: Any, truth: Any, words: str) -> None:
-    with refused(words):
-        slope_error(x, y, truth)
+    for function in (slope_error, slope_statistics):
+        with refused(words):
+            function(x, y, truth)
 
 
 def test_standard_error_of_r_covers_the_truth() -> None:
@@ -76,7 +77,6 @@ def test_statistics_of_a_known_estimator() -> None:
         assert abs(estimate.value - value) < 5 * estimate.standard_error, name
         assert estimate.standard_error < 0.01
     assert statistics.error == slope_error(found[:, 0], found[:, 1], truth)
-    assert statistics.invalid_fraction.value == 0.0
 
 
 def test_standard_errors_of_statistics_are_the_spread() -> None:
@@ -90,16 +90,15 @@ def test_standard_errors_of_statistics_are_the_spread() -> None:
 
 
 def test_falling_back_to_the_centre_is_seen() -> None:
-    """R alone prefers no estimate at all to a noisy one; gain, validity and corrected rms do not."""
+    """R alone prefers no estimate at all to a noisy one; gain and corrected rms do not."""
     rng = np.random.default_rng(3)
     truth = rng.uniform(-1, 1, (1000, 2))
-    nothing = slope_statistics(np.zeros(1000), np.zeros(1000), truth, valid=np.zeros(1000, bool))
+    nothing = slope_statistics(np.zeros(1000), np.zeros(1000), truth)
     noisy_slopes = truth + rng.normal(0, 0.7, truth.shape)
     noisy = slope_statistics(noisy_slopes[:, 0], noisy_slopes[:, 1], truth)
     assert nothing.error.value < noisy.error.value
     assert nothing.gain.value == 0.0
     assert nothing.corrected_rms.value == np.inf
-    assert nothing.invalid_fraction.value == 1.0
     assert nothing.outlier_fraction.value == 0.0
 
 
@@ -107,7 +106,6 @@ def test_outliers_are_beyond_the_limit_on_either_axis() -> None:
     x, y = np.array([0.0, 1.5, 0.0, 0.9]), np.array([0.0, 0.0, -2.0, 0.9])
     truth = np.zeros((4, 2))
     assert slope_statistics(x, y, truth).outlier_fraction.value == 0.5
-    assert slope_statistics(x, y, truth, outlier_px=0.5).outlier_fraction.value == 0.75
     assert np.isnan(slope_statistics(x, y, truth).gain.value)  # the truth does not vary
 
 
@@ -117,17 +115,6 @@ def test_perfect_slopes_have_gain_one_and_no_error() -> None:
     assert statistics.gain.value == pytest.approx(1.0)
     assert statistics.corrected_rms.value == pytest.approx(0.0, abs=1e-12)
     assert statistics.rms.value == 0.0
-
-
-@pytest.mark.parametrize(
-    ("options", "words"),
-    [({"valid": [True]}, "valid: expected shape (3,)"), ({"outlier_px": 0}, "outlier_px = 0")],
-)
-def test_statistics_refuse_wrong_options(options: dict[str, Any], words: str) -> None:
-    with refused(words):
-        slope_statistics(np.ones(3), np.ones(3), np.ones((3, 2)), **options)
-    with pytest.raises(InputError, match="at least one value"):
-        slope_statistics([], [], np.ones((0, 2)))
 
 
 def test_an_estimate_has_an_interval() -> None:

@@ -110,9 +110,7 @@ class SlopeStatistics:
     """rms after offset and gain are taken off: of (estimate - offset) / gain - truth, px. What a control loop
     of the right gain is left with. Infinite where the gain is not above 0, NaN where it is not defined."""
     outlier_fraction: Estimate
-    """Fraction of slopes with an error beyond `outlier_px` on either axis."""
-    invalid_fraction: Estimate
-    """Fraction of slopes that are not valid; they count as they are in everything else."""
+    """Fraction of slopes with an error beyond `OUTLIER_PX` on either axis."""
 
     @property
     def ranking_rms(self) -> float:
@@ -121,14 +119,7 @@ class SlopeStatistics:
         return rms if math.isfinite(rms) else math.inf
 
 
-def slope_statistics(
-    x: ArrayLike,
-    y: ArrayLike,
-    truth: ArrayLike,
-    *,
-    valid: ArrayLike | None = None,
-    outlier_px: float = OUTLIER_PX,
-) -> SlopeStatistics:
+def slope_statistics(x: ArrayLike, y: ArrayLike, truth: ArrayLike) -> SlopeStatistics:
     """Return error, gain, rms and outliers of slopes whose truth is known.
 
     Gain and offset are those of a linear regression of the estimate on the truth: an offset for each axis,
@@ -138,33 +129,23 @@ def slope_statistics(
     ----------
     x, y : (...) array, px
     truth : (..., 2) array, px
-    valid : (...) array of bool, optional
-        Which slopes were measured. Default: all.
-    outlier_px : float
-        Error on either axis beyond which a slope is an outlier.
 
     Raises
     ------
     InputError
-        When the shapes do not fit, there are no slopes, or the limit is not above 0.
+        When the shapes do not fit, or there are no slopes.
     """
-    outlier_px = number_between("outlier_px", outlier_px, 0.0, low_open=True)
-    estimate = np.stack([finite_array("x", x), finite_array("y", y)], axis=-1).astype(np.float64)
     error = absolute_errors(x, y, truth).ravel()
-    measured = np.ones(estimate.shape[:-1], bool) if valid is None else np.asarray(valid, dtype=bool)
-    if measured.shape != estimate.shape[:-1]:
-        raise InputError(f"valid: expected shape {estimate.shape[:-1]}, got {measured.shape}")
-    estimate = estimate.reshape(-1, 2)
+    estimate = np.stack([np.ravel(x), np.ravel(y)], axis=-1).astype(np.float64)
     true = np.asarray(truth, dtype=np.float64).reshape(-1, 2)
     gain, corrected_rms = _gain_and_corrected_rms(estimate, true)
-    outlier = np.any(np.abs(estimate - true) > outlier_px, axis=1)
+    outlier = np.any(np.abs(estimate - true) > OUTLIER_PX, axis=1)
     return SlopeStatistics(
         Estimate.of_mean(error),
         gain,
         _root(Estimate.of_mean(np.mean(np.square(estimate - true), axis=1))),
         corrected_rms,
         Estimate.of_mean(outlier.astype(np.float64)),
-        Estimate.of_mean(1.0 - measured.ravel()),
     )
 
 
