@@ -1,5 +1,3 @@
-import importlib
-import sys
 import warnings
 from typing import Any
 
@@ -8,7 +6,7 @@ import pytest
 from tests.refusals import refused
 
 import faintspot as fs
-from faintspot import InputError, MissingExtraError, Settings
+from faintspot import InputError, Settings
 
 hcipy = pytest.importorskip("hcipy", reason="hcipy is not installed (extra loop)")
 
@@ -253,10 +251,3 @@ def test_images_that_do_not_fit(optics: Any) -> None:
     ):
         with pytest.raises(InputError, match=message):
             estimator.estimate(images)
-
-
-def test_a_missing_hcipy_is_said_in_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "hcipy", None)
-    monkeypatch.delitem(sys.modules, "faintspot.adapters.hcipy")
-    with pytest.raises(MissingExtraError, match=r"faintspot\[loop\]"):
-        importlib.import_module("faintspot.adapters.hcipy")

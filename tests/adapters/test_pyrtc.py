@@ -1,4 +1,3 @@
-import sys
 from types import SimpleNamespace
 from typing import Any
 from uuid import uuid4
@@ -9,7 +8,7 @@ from tests.adapters.adapter_cases import ESTIMATORS, POSITIONS, SIDE, N, images,
 from tests.adapters.test_specula import GRID, TABLES, frame_of
 from tests.refusals import refused
 
-from faintspot import InputError, MissingExtraError
+from faintspot import InputError
 from faintspot.adapters import pyrtc
 from faintspot.adapters.pyrtc import _Measuring
 
@@ -100,6 +99,8 @@ def test_refused_in_one_line() -> None:
         _Measuring({})
     with pytest.raises(InputError, match="measure one first"):
         _ = measuring().tool
+    with pytest.raises(AttributeError, match="no attribute 'Slopes'"):
+        _ = pyrtc.Slopes
     message = r"10 px on the frame of 30 x 30, got 3 that leave it, first row 2, column 0; leave them out"
     with pytest.raises(InputError, match=message):
         measuring().maps(process(offset_y=1), frame_of(images()), no_stream)
@@ -135,15 +136,6 @@ def test_frames_of_another_size() -> None:
     own.maps(process(), frame_of(images()), no_stream)
     with pytest.raises(InputError, match=r"frame: expected shape \(30, 30\) .* got \(40, 30\)"):
         own.maps(process(), np.ones((40, 30)), no_stream)
-
-
-def test_a_missing_pyrtc_is_said_in_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "pyrtc", None)
-    pyrtc.slopes_process.cache_clear()
-    with pytest.raises(MissingExtraError, match=r"faintspot\[pyrtc\]"):
-        _ = pyrtc.FaintspotSlopes
-    with pytest.raises(AttributeError, match="no attribute 'Slopes'"):
-        _ = pyrtc.Slopes
 
 
 @needs("pyrtc", "pyrtc")

@@ -12,7 +12,7 @@ from tests.patience import wait_for
 from tests.shared_data import ROOT
 
 import faintspot as fs
-from faintspot import InputError, MissingExtraError, Settings
+from faintspot import InputError, Settings
 from faintspot.adapters import pyrtc
 from faintspot.adapters.pyrtc import _Frames, _Measuring
 from faintspot.engine.segment import FOLDER
@@ -88,15 +88,11 @@ def test_frames_of_another_size_are_waited_out(name: str, caplog: pytest.LogCapt
     wait_for(lambda: frames.next_into(taken))
 
 
-def test_frames_refused_in_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_frames_refused_in_one_line() -> None:
     with pytest.raises(InputError, match=r"wfs.frames: expected the name of a stream, got None"):
         _Frames({"width": 5, "height": 6})
     with pytest.raises(InputError, match="isio"):
         _Frames(configuration("isio:../x"))
-    pyrtc.camera.cache_clear()
-    monkeypatch.setitem(__import__("sys").modules, "pyrtc", None)
-    with pytest.raises(MissingExtraError, match=r"faintspot\[pyrtc\]"):
-        _ = pyrtc.FaintspotCamera
 
 
 @needs("pyrtc", "pyrtc")

@@ -1,4 +1,3 @@
-import sys
 from typing import Any
 
 import numpy as np
@@ -6,7 +5,7 @@ import pytest
 from tests.adapters.adapter_cases import ESTIMATORS, POSITIONS, SIDE, N, images, needs, noisy
 from tests.refusals import refused
 
-from faintspot import InputError, MissingExtraError
+from faintspot import InputError
 
 pytestmark = pytest.mark.filterwarnings("ignore")
 GRID = 3
@@ -21,13 +20,6 @@ def frame_of(stack: np.ndarray) -> np.ndarray:
 def idxs() -> np.ndarray:
     numbers = np.arange((GRID * SIDE) ** 2).reshape(GRID * SIDE, GRID * SIDE)
     return numbers.reshape(GRID, SIDE, GRID, SIDE).transpose(0, 2, 1, 3).reshape(N, SIDE * SIDE)
-
-
-def test_a_missing_specula_is_said_in_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "specula", None)
-    monkeypatch.delitem(sys.modules, "faintspot.adapters.specula.faintspot_slopec", raising=False)
-    with pytest.raises(MissingExtraError, match=r"faintspot\[specula\]"):
-        import faintspot.adapters.specula.faintspot_slopec  # noqa: F401
 
 
 @needs("specula", "specula")

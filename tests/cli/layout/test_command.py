@@ -9,6 +9,7 @@ import pytest
 from numpy.typing import NDArray
 from tests.cli.cli_cases import Commands
 from tests.shared_data import shared_file
+from tests.slopes.sensor.sensor_cases import spot_frame
 
 from faintspot import Calibration, Layout, Settings
 from faintspot.base.errors import DoubtWarning
@@ -304,7 +305,7 @@ def test_dark_level_and_hot_pixels_of_the_frame(run: Commands, folder: Path) -> 
     array = frames()
     array[:, 5, 70] = 4000
     array[:, 80, 3] = 3000
-    np.save(folder / "frames.npy", array)
+    np.save("frames.npy", array)
     result = run.ok("layout", "frames.npy", "-o", "new.toml", "--mask-hot-pixels", "--gain-e-per-adu", 2)
     assert "2 hot pixels masked" in result.out
     calibration = Calibration.load(folder / "new.toml")
@@ -317,10 +318,7 @@ def test_dark_level_and_hot_pixels_of_the_frame(run: Commands, folder: Path) -> 
 
 
 @pytest.mark.usefixtures("only_found")
-def test_settings_without_a_layout_are_kept(
-    run: Commands, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
+def test_settings_without_a_layout_are_kept(folder: Path, run: Commands) -> None:
     settings = Settings(estimator="weighted", spot_fwhm_px=2.5)
     settings.save("tuned.toml")
     np.save("spots.npy", frames())
@@ -329,16 +327,12 @@ def test_settings_without_a_layout_are_kept(
     assert "already exists" in run.refused("layout", "spots.npy", "-o", "tuned.toml").error
 
 
-def defocused(stretch: float = 1.02) -> NDArray[np.float32]:
+def defocused(stretch: float = 1.02) -> NDArray[np.float64]:
     """Return a frame of 11 x 11 sub-apertures, 24 px apart, whose spots lie on a wider lattice."""
-    y, x = np.mgrid[:320, :320]
-    frame = np.zeros((320, 320))
-    for row, column in np.argwhere(np.ones((11, 11))) - 5:
-        if np.hypot(row, column) <= 5.4:
-            dx, dy = stretch * 24 * column, stretch * 24 * row
-            frame += 5000 / (4 * np.pi) * np.exp(-((x - 159.5 - dx) ** 2 + (y - 159.5 - dy) ** 2) / 4)
-    rng = np.random.default_rng(1)
-    return (rng.poisson(frame + 20) + rng.normal(100, 3, frame.shape)).astype(np.float32)
+    row, column = np.indices((11, 11)).reshape(2, -1) - 5
+    cells = (column + 1j * row)[np.hypot(row, column) <= 5.4]
+    nodes = np.asarray(159.5 * (1 + 1j) + stretch * 24 * cells, np.complex128)
+    return spot_frame(nodes, (320, 320), flux_e=5000.0, width_px=np.sqrt(2), background_e=20.0)
 
 
 def shown(run: Commands) -> NDArray[np.float64]:
@@ -371,12 +365,17 @@ def test_a_stated_pitch_keeps_the_defocus_of_the_frame(folder: Path, run: Comman
 def test_what_a_layout_estimated_is_estimated_again_and_what_is_stated_stays(
     folder: Path, run: Commands
 ) -> None:
+    """Dark level and noise, so that slopes have standard errors; the noise stated first, then estimated."""
     arguments = ("layout", "a.npy", "--overwrite", "-o", "new.toml")
     np.save("a.npy", defocused(1.0))
-    run.ok(*arguments, "--read-noise-e", "3")
+    run.ok(*arguments)
     first = Calibration.load("new.toml")
     assert first.dark == pytest.approx(120, abs=1)
-    assert "dark" in first.estimated
+    assert first.read_noise_e == pytest.approx(np.sqrt(20 + 3**2), rel=0.1)
+    assert {"dark", "read_noise_e"} <= set(first.estimated)
+    run.ok("slopes", "a.npy", "-c", "new.toml", "-o", "s.npz")
+    assert np.isfinite(read_slopes("s.npz").variables["standard_error_x"]).all()
+    run.ok(*arguments, "--read-noise-e", "3")
     np.save("a.npy", defocused(1.0) - 20)
     result = run.ok(*arguments)
     again = Calibration.load("new.toml")
@@ -423,17 +422,3 @@ def test_one_bad_frame_does_not_decide_the_settings(folder: Path, run: Commands,
         assert out.count("left out") == 2
         assert Settings.load(f"{index}.toml") == Settings.load("good.toml")
         assert Calibration.load(f"{index}.toml") == Calibration.load("good.toml")
-
-
-@pytest.mark.usefixtures("only_found")
-def test_the_noise_goes_into_the_configuration(folder: Path, run: Commands) -> None:
-    """So that slopes have standard errors; estimated again by another layout, and not stated to tune."""
-    np.save("a.npy", frames())
-    run.ok("layout", "a.npy", "-o", "new.toml", "--pixels", 16)
-    camera = Calibration.load("new.toml")
-    assert camera.read_noise_e == pytest.approx(3.0, rel=0.1)
-    assert "read_noise_e" in camera.estimated
-    run.ok("slopes", "a.npy", "-c", "new.toml", "-o", "s.npz")
-    assert np.isfinite(read_slopes("s.npz").variables["standard_error_x"]).all()
-    run.ok("layout", "a.npy", "-o", "new.toml", "--pixels", 16, "--overwrite", "--read-noise-e", 4)
-    assert Calibration.load("new.toml").read_noise_e == 4

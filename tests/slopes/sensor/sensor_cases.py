@@ -6,7 +6,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from faintspot.slopes.sensor.detection.lenslets import LensletGrid
 from faintspot.slopes.simulate import Detector, sensor_frames
+
+RATIOS = {"square": 1j, "hexagonal": np.exp(1j * np.pi / 3)}
+"""Second step of a lattice over the first."""
 
 
 @dataclass
@@ -56,3 +60,79 @@ def spot_frame(
         rng=rng,
     )
     return np.asarray(frames[:, margin:-margin, margin:-margin].mean(axis=0))
+
+
+class Sensor:
+    """An annular pupil on a lattice that fills the frame, and one frame of it."""
+
+    def __init__(
+        self,
+        seed: int,
+        *,
+        geometry: str = "square",
+        pitch_px: float = 20.0,
+        angle_deg: float | None = None,
+        lenslets: int = 12,
+        inner: float = 0.3,
+        spider: float = 0.0,
+        flux_e: float = 2000.0,
+        scatter: float = 0.15,
+        outside: float = 0.0,
+        width: float = 0.07,
+        background_e: float = 20.0,
+        haze_e: float = 0.0,
+        hot_pixels: int = 0,
+        **detector: Any,
+    ) -> None:
+        self.rng = rng = np.random.default_rng(seed)
+        self.size = size = int((lenslets + 3) * pitch_px)
+        self.pitch_px = pitch_px
+        drawn_deg = rng.uniform(-20, 20)
+        step = pitch_px * np.exp(1j * np.radians(drawn_deg if angle_deg is None else angle_deg))
+        count = np.arange(-2 * lenslets, 2 * lenslets + 1)
+        grid = count + count[:, None] * RATIOS[geometry]
+        offset = step * (grid.ravel() + rng.uniform(-0.5, 0.5) + 1j * rng.uniform(-0.5, 0.5))
+        nodes = offset + (1 + 1j) * (size - 1) / 2
+        seen = (np.minimum(nodes.real, nodes.imag) > 2) & (np.maximum(nodes.real, nodes.imag) < size - 3)
+        offset, self.nodes = offset[seen], nodes[seen]
+        radius = np.abs(offset) / (pitch_px * lenslets / 2)
+        self.illuminated = (radius < 1) & (radius > inner)
+        self.illuminated &= np.minimum(np.abs(offset.real), np.abs(offset.imag)) >= spider * pitch_px
+        self.flux_e = flux_e * np.exp(scatter * rng.standard_normal(len(radius)))
+        self.flux_e[~self.illuminated] *= outside
+        self.width_px = max(width * pitch_px, 0.8)
+        margin = 2 * int(np.ceil(4 * self.width_px)) + 2
+        y, x = np.mgrid[-margin : size + margin, -margin : size + margin] - size / 2
+        self.background_e = background_e + haze_e * np.exp(-2 * (x**2 + y**2) / (pitch_px * lenslets) ** 2)
+        self.hot_pixels = hot_pixels
+        self.detector = detector
+        self.seed = seed
+
+    def frame(self) -> NDArray[np.float64]:
+        image = spot_frame(
+            self.nodes,
+            (self.size, self.size),
+            flux_e=self.flux_e,
+            spread_px=0.06 * self.pitch_px,
+            width_px=self.width_px,
+            seed=self.seed,
+            background_e=self.background_e,
+            **self.detector,
+        )
+        row, column = self.rng.integers(0, self.size, (2, self.hot_pixels))
+        image[row, column] += self.rng.uniform(50, 3000, self.hot_pixels)
+        return np.asarray(image)
+
+    def wrong(self, grid: LensletGrid) -> tuple[int, int]:
+        """Return how many lit lenslets are missing, and how many found ones are not lit."""
+        near = self._distances(grid) < 0.3
+        return int(np.count_nonzero(~near.any(axis=0))), int(np.count_nonzero(~near.any(axis=1)))
+
+    def errors(self, grid: LensletGrid) -> NDArray[np.float64]:
+        """Return the distances of found nodes from those of lit lenslets, pitches."""
+        nearest = self._distances(grid).min(axis=1)
+        return np.asarray(nearest[nearest < 0.3])
+
+    def _distances(self, grid: LensletGrid) -> NDArray[np.float64]:
+        found = grid.centres @ [1, 1j]
+        return np.asarray(np.abs(found[:, None] - self.nodes[self.illuminated]) / self.pitch_px)

@@ -6,14 +6,12 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from tests.slopes.sensor.sensor_cases import spot_frame
+from tests.slopes.sensor.sensor_cases import RATIOS, spot_frame
 
 import faintspot as fs
 from faintspot import Layout
 from faintspot.slopes.sensor.found_layout import find_illuminated, find_layout
 from faintspot.slopes.simulate import Detector, sensor_frames
-
-RATIOS = {"square": 1j, "hexagonal": np.exp(1j * np.pi / 3)}
 
 
 @dataclass(frozen=True)

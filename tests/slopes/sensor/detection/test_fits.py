@@ -5,12 +5,11 @@ import pytest
 from benchmarks.layouts import verdict
 from benchmarks.simulated_arrays import plain_small, random_array
 from numpy.typing import NDArray
-from tests.slopes.sensor.sensor_cases import spot_frame
+from tests.slopes.sensor.sensor_cases import RATIOS, spot_frame
 
 from faintspot.base.errors import InputError
 from faintspot.slopes.sensor.detection.lenslets import find_lenslets
 
-RATIOS = {"square": 1j, "hexagonal": np.exp(1j * np.pi / 3)}
 PLAIN = plain_small()
 
 

@@ -1,77 +1,15 @@
 import gzip
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from scipy.special import erf
 from tests.refusals import refused
 from tests.shared_data import shared_file
-from tests.slopes.sensor.sensor_cases import spot_frame
+from tests.slopes.sensor.sensor_cases import RATIOS, Sensor, spot_frame
 
 from faintspot.base.errors import InputError
 from faintspot.slopes.sensor.detection.lenslets import LensletGrid, find_lenslets
-
-RATIOS = {"square": 1j, "hexagonal": np.exp(1j * np.pi / 3)}
-
-
-@dataclass(frozen=True)
-class Simulated:
-    image: NDArray[np.float64]
-    nodes: NDArray[np.complex128]
-    geometry: str
-    pitch_px: float
-
-
-def simulated(
-    *,
-    geometry: str = "square",
-    lenslets: int = 10,
-    pitch_px: float = 16.0,
-    angle_deg: float = 3.0,
-    spot_px: float = 1.4,
-    flux: float = 3000.0,
-    shift: float = 0.15,
-    annular: bool = True,
-    hot_pixels: int = 30,
-    seed: int = 1,
-) -> Simulated:
-    """Gaussian spots, randomly shifted, on a background gradient, with hot pixels and cosmic-ray tracks."""
-    rng = np.random.default_rng(seed)
-    size = int((lenslets * (1.0 if annular else 1.42) + 2.0) * pitch_px)
-    step = pitch_px * np.exp(1j * np.radians(angle_deg))
-    row, column = np.mgrid[-2 * lenslets : 2 * lenslets + 1, -2 * lenslets : 2 * lenslets + 1]
-    cell = (column + row * RATIOS[geometry] + rng.uniform(-0.5, 0.5) + 1j * rng.uniform(-0.5, 0.5)).ravel()
-    radius = 2 * np.abs(cell) / lenslets
-    square = (np.abs(cell.real) < lenslets / 2) & (np.abs(cell.imag) < lenslets / 2)
-    nodes = step * cell[(radius < 1) & (radius > 0.3) if annular else square] + (size - 1) / 2 * (1 + 1j)
-    moves = rng.uniform(-1, 1, nodes.size) + 1j * rng.uniform(-1, 1, nodes.size)
-    spots = nodes + shift * pitch_px * moves
-    pixel = np.arange(size)
-
-    def profile(centre: NDArray[np.float64]) -> NDArray[np.float64]:
-        offset = (pixel - centre[:, None]) / (np.sqrt(2) * spot_px)
-        half = 0.5 / (np.sqrt(2) * spot_px)
-        return np.asarray(erf(offset + half) - erf(offset - half)) / 2
-
-    image = 20 + 30 * pixel / size + flux * profile(spots.imag).T @ profile(spots.real)
-    image = rng.poisson(image) + 3.0 * rng.standard_normal(image.shape)
-    image[rng.integers(0, size, hot_pixels), rng.integers(0, size, hot_pixels)] += rng.uniform(
-        50, 3000, hot_pixels
-    )
-    for _ in range(3):
-        y, x = rng.integers(0, size - 8, 2)
-        image[y + np.arange(8), x + np.arange(8)] += 500.0
-    return Simulated(image, nodes, geometry, pitch_px)
-
-
-def errors(grid: LensletGrid, truth: Simulated) -> tuple[NDArray[np.float64], int, int]:
-    """Return the nodes' errors in pitches, how many lit lenslets are missing and how many are false."""
-    found = grid.centres[:, 0] + 1j * grid.centres[:, 1]
-    distance = np.abs(found[:, None] - truth.nodes) / truth.pitch_px
-    near = distance.min(axis=1) < 0.3
-    return distance.min(axis=1)[near], int((distance.min(axis=0) >= 0.3).sum()), int((~near).sum())
 
 
 def check_regular(grid: LensletGrid) -> None:
@@ -93,81 +31,72 @@ def check_regular(grid: LensletGrid) -> None:
     [(4, 16, 10), (6, 24, -70), (10, 8, 3), (10, 40, 44.5), (14, 22, -17), (20, 12, 29.5), (40, 8, 61)],
 )
 def test_simulated_grid_is_found(geometry: str, lenslets: int, pitch_px: float, angle_deg: float) -> None:
-    annular = lenslets > 6
-    truth = simulated(
-        geometry=geometry,
-        lenslets=lenslets,
-        pitch_px=pitch_px,
-        angle_deg=angle_deg,
-        annular=annular,
-        spot_px=0.09 * pitch_px,
-        flux=100 * (0.09 * pitch_px) ** 2 * 10,
-        hot_pixels=lenslets**2 // 4,
-    )
-    grid = find_lenslets(truth.image)
+    inner = 0.3 if lenslets > 6 else 0.0
+    shape: dict[str, Any] = {"geometry": geometry, "lenslets": lenslets, "pitch_px": pitch_px, "inner": inner}
+    flux_e, hot_pixels = 8.0 * pitch_px**2, lenslets**2 // 4
+    truth = Sensor(1, **shape, angle_deg=angle_deg, width=0.09, flux_e=flux_e, hot_pixels=hot_pixels)
+    grid = find_lenslets(truth.frame())
     check_regular(grid)
     assert grid.geometry == geometry
-    # The spots are shifted by 0.087 pitch rms per axis. The fit's pitch has an error of
-    # 0.087 / sqrt(sum |node|^2), the sum over n nodes being about n * lenslets^2 / 6 (or more). Three
+    # The spots are displaced by 0.06 pitch rms per axis. The fit's pitch has an error of
+    # 0.06 / sqrt(sum |node|^2), the sum over n nodes being about n * lenslets^2 / 6 (or more). Three
     # standard errors are allowed for: less than 0.5 % from 14 lenslets on.
-    count = len(truth.nodes)
-    tolerance = 3 * 0.087 * np.sqrt(6 / count) / lenslets
-    assert abs(grid.pitch_px / pitch_px - 1) < max(tolerance, 0.001)
-    if lenslets >= 14:
-        assert tolerance < 0.005
+    count = np.count_nonzero(truth.illuminated)
+    tolerance = max(3 * 0.06 * np.sqrt(6 / count) / lenslets, 0.001)
+    assert grid.pitch_px == pytest.approx(pitch_px, rel=tolerance)
     turn = 90 if geometry == "square" else 60
     turned = (grid.angle_deg - angle_deg + turn / 2) % turn - turn / 2
-    assert abs(np.radians(turned)) < max(tolerance, 0.001)
-    error, missing, false = errors(grid, truth)
-    # Four parameters are fitted to 2 n coordinates: rms error 0.087 * sqrt(4 / n) per node, 5 % at n = 12.
-    assert np.sqrt(np.mean(error**2)) < max(2 * 0.087 * np.sqrt(4 / count), 0.02)
+    assert abs(np.radians(turned)) < tolerance
+    # Four parameters are fitted to 2 n coordinates: rms error 0.06 * sqrt(4 / n) per node, 3 % at n = 12.
+    assert np.sqrt(np.mean(truth.errors(grid) ** 2)) < max(2 * 0.06 * np.sqrt(4 / count), 0.02)
+    missing, false = truth.wrong(grid)
     assert missing <= 0.01 * count
-    # A cosmic ray next to a lit lenslet passes for one.
     assert false <= 2
 
 
 @pytest.mark.parametrize("geometry", ["square", "hexagonal"])
 def test_five_sigma_spots(geometry: str) -> None:
     # Noise of a background of 35 and 3 of read noise: 6.6; 5 of them in a Gaussian matched filter.
-    flux = 5 * 6.6 * np.sqrt(4 * np.pi) * 1.3
-    truth = simulated(geometry=geometry, lenslets=14, pitch_px=22, spot_px=1.3, flux=flux)
-    grid = find_lenslets(truth.image)
+    flux_e = 5 * 6.6 * np.sqrt(4 * np.pi) * 1.3
+    shape: dict[str, Any] = {"geometry": geometry, "lenslets": 14, "pitch_px": 22.0, "width": 1.3 / 22}
+    truth = Sensor(1, **shape, flux_e=flux_e, scatter=0.0, background_e=35.0)
+    grid = find_lenslets(truth.frame())
     assert grid.geometry == geometry
-    assert abs(grid.pitch_px / 22 - 1) < 0.005
-    error, missing, false = errors(grid, truth)
-    assert np.sqrt(np.mean(error**2)) < 0.05
+    assert grid.pitch_px == pytest.approx(22, rel=0.005)
+    assert np.sqrt(np.mean(truth.errors(grid) ** 2)) < 0.05
     # A ratio of 5 with a standard deviation of 1 lies below the threshold of 4 in one case of six.
-    assert missing < 0.3 * len(truth.nodes)
-    assert false < 0.05 * len(truth.nodes)
+    missing, false = truth.wrong(grid)
+    count = np.count_nonzero(truth.illuminated)
+    assert missing < 0.3 * count
+    assert false < 0.05 * count
 
 
 def test_flux_is_that_of_the_spots() -> None:
-    truth = simulated(flux=3000.0, hot_pixels=0, shift=0.0)
-    grid = find_lenslets(truth.image)
+    grid = find_lenslets(Sensor(1, flux_e=3000.0, scatter=0.0).frame())
     # 2.5 standard deviations hold 95.6 % of a Gaussian; the width is found to 25 %.
     assert np.median(grid.flux) == pytest.approx(3000.0, rel=0.15)
 
 
 def test_hint_and_geometry_are_obeyed() -> None:
-    truth = simulated(seed=5)
-    grid = find_lenslets(truth.image, geometry="square", pitch_px=17.5)
+    frame = Sensor(5, pitch_px=16.0).frame()
+    grid = find_lenslets(frame, geometry="square", pitch_px=17.5)
     assert grid.pitch_px == pytest.approx(16.0, rel=0.01)
     with pytest.raises(InputError, match="lattice"):
-        find_lenslets(truth.image, pitch_px=5.0)
+        find_lenslets(frame, pitch_px=5.0)
 
 
 def test_cube_beats_cosmic_rays_and_bad_pixels_may_be_nan() -> None:
-    truth = simulated(seed=6, hot_pixels=0)
-    cube = np.repeat(truth.image[None], 5, axis=0)
+    truth = Sensor(6, pitch_px=16.0)
+    cube = np.repeat(truth.frame()[None], 5, axis=0)
     cube[2, 40:60, 40:60] += 1e5
-    bad = np.zeros(truth.image.shape, dtype=bool)
+    bad = np.zeros(cube.shape[1:], dtype=bool)
     bad[:, 30] = True
     cube[:, bad] = np.nan
     before = cube.copy()
     grid = find_lenslets(cube, bad_pixels=bad)
     np.testing.assert_array_equal(cube, before)
     assert grid.pitch_px == pytest.approx(16.0, rel=0.01)
-    assert errors(grid, truth)[1] <= 2
+    assert truth.wrong(grid)[0] <= 2
 
 
 def spots_at(positions: list[tuple[int, int]]) -> NDArray[np.float64]:
