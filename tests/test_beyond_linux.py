@@ -125,5 +125,5 @@ def test_the_other_ways_into_real_time_say_so_too(
 ) -> None:
     run = Commands(capsys)
     monkeypatch.setattr(errors, "SHARED_MEMORY", tmp_path / "none")
-    for line in ("live", "realtime demo", "telemetry --engine faintspot"):
+    for line in ("live", "realtime demo"):
         run.refused(*line.split(), naming=("needs shared memory", "which Linux has"))

@@ -1,7 +1,6 @@
-"""faintspot telemetry of a running engine: it is recorded first, and the recording is kept where asked."""
+"""faintspot telemetry: questions, controllers, and methods that alternated."""
 
 import json
-import secrets
 from pathlib import Path
 
 import numpy as np
@@ -12,8 +11,6 @@ pytest.importorskip("matplotlib")
 pytest.importorskip("jinja2")
 pytest.importorskip("zarr")
 
-from tests.engine import telemetry_cases
-from tests.engine.telemetry_cases import FIELDS, LAYOUT, SETTINGS, Engine, N
 from tests.experiments.night.recorded_cases import BEGIN_S, write_recording
 from tests.io import loop_layouts
 from tests.loop.telemetry.alternation_cases import (
@@ -26,48 +23,7 @@ from tests.loop.telemetry.alternation_cases import (
 )
 from tests.loop.telemetry.loop_cases import recorded
 
-from faintspot.engine.segment import FOLDER
-from faintspot.engine.telemetry.ring import TelemetryRing
-from faintspot.io import read_telemetry
-from faintspot.slopes.pipeline.slopes import RESULT_TYPES, Slopes
 from faintspot.slopes.sensor.layout import Layout
-
-pytestmark = pytest.mark.skipif(not FOLDER.is_dir(), reason="needs POSIX shared memory as Linux has it")
-
-
-def noisy(frame: int) -> Slopes:
-    """Slopes of noise alone."""
-    values = {name: np.zeros(N, kind) for name, kind in zip(FIELDS, RESULT_TYPES, strict=True)}
-    noise = np.random.default_rng(frame).normal(0, 0.1, (2, N)).astype(np.float32)
-    return Slopes(**{**values, "x": noise[0], "y": noise[1]})
-
-
-@pytest.mark.slow
-def test_running_engine_is_reported(folder: Path, run: Commands, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(telemetry_cases, "slopes_of", noisy)
-    name = f"faintspot-test-{secrets.token_hex(6)}"
-    with Engine(TelemetryRing.create(name, LAYOUT, settings=SETTINGS)):
-        told = run.ok("telemetry", "--engine", name, "--seconds", "1")
-        assert told.out.endswith(f"{name}.html: open it in a browser; {name}.json has the numbers\n")
-        assert "time is over" in told.err
-        written = {each.name for each in folder.iterdir()}
-        assert written == {"faintspot.toml", f"{name}.html", f"{name}.json"}
-        assert json.loads(Path(f"{name}.json").read_text())
-        run.ok("telemetry", "night.zarr", "--engine", name, "--seconds", "1", "-o", "page.html")
-        assert len(read_telemetry("night.zarr").frame) > 0
-        assert Path("page.html").exists()
-        run.refused("telemetry", "night.zarr", "--engine", name, naming=("night.zarr", "exists"))
-        run.refused("telemetry", "night.fits", "--engine", name, naming=("ends in .zarr",))
-        run.refused("telemetry", "--engine", name, "-c", "absent.toml", naming=("absent.toml",))
-
-
-def test_engine_without_frames(folder: Path, run: Commands) -> None:
-    name = f"faintspot-test-{secrets.token_hex(6)}"
-    ring = TelemetryRing.create(name, LAYOUT, settings=SETTINGS)
-    told = run("telemetry", "--engine", name, "--seconds", "0.2")
-    ring.close()
-    assert told.code == 2
-    assert f"{name}: no frames in 0.2 s" in told.err
 
 
 def test_a_question_at_a_time(folder: Path, run: Commands) -> None:
@@ -82,12 +38,6 @@ def test_a_question_at_a_time(folder: Path, run: Commands) -> None:
     run.refused(*given, naming=("--cells",))
     given += ["--cells", "none", "--slope-order", "rows"]
     run.refused(*given, naming=("slope_order", "pairs"))
-
-
-def test_what_does_not_fit_together(folder: Path, run: Commands) -> None:
-    run.refused("telemetry", naming=("expected FILE or --engine",))
-    run.refused("telemetry", "night.zarr", "--seconds", "3", naming=("expected --engine",))
-    run.refused("telemetry", "--engine", "nobody", naming=("start the engine first",))
 
 
 @pytest.mark.slow

@@ -1,17 +1,14 @@
-"""faintspot telemetry: report of a recorded loop of any system, or of the running engine."""
+"""faintspot telemetry: report of a recorded loop of any system."""
 
 from __future__ import annotations
 
-import tempfile
-from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
-from faintspot.base.checks import not_none
-from faintspot.base.errors import InputError, errors_within, require, require_linux
+from faintspot.base.errors import InputError, errors_within
 from faintspot.base.files import derived, write_atomically
 from faintspot.base.text_files import to_json
 from faintspot.cli.commands import SectionedCommand, declared, needs, option
@@ -19,30 +16,24 @@ from faintspot.cli.output import progress_bar
 from faintspot.slopes.sensor.layout import OPTICS, Layout
 
 if TYPE_CHECKING:
+    from faintspot.loop.control.identification.learnt_loop import ObservedLoop
     from faintspot.loop.control.identification.recording import Recording
     from faintspot.loop.telemetry.page import Piece
+    from faintspot.loop.telemetry.report import LoopReport
 
-_SECONDS = 20.0
 _LACKS = "What FILE lacks"
 
 
 @needs("report", "matplotlib", "jinja2")
 @click.command(cls=SectionedCommand)
-@click.argument("recording", type=click.Path(path_type=Path), required=False, metavar="[FILE]")
-@option("--engine", metavar="NAME", help="Record this running engine first; FILE keeps the recording.")
-@option(
-    "--seconds",
-    type=click.FloatRange(0, min_open=True),
-    help="Time to record with --engine.",
-    show_default=f"{_SECONDS:g}",
-)
+@click.argument("recording", type=click.Path(path_type=Path), metavar="FILE")
 @option("--system", metavar="TOML", help="Values that FILE lacks, such as rate, unit, matrix and geometry.")
 @option(
     "-c",
     "--config",
     metavar="TOML",
     help="Configuration with [control], for recordings of the engine.",
-    show_default="as recorded; with --engine: faintspot.toml",
+    show_default="as recorded",
 )
 @option(
     "--strehl",
@@ -86,11 +77,9 @@ _LACKS = "What FILE lacks"
 @option("--frame-rate-hz", type=float, metavar="HZ", section=_LACKS, help="Frame rate.")
 @declared(Layout, *OPTICS, sections="Telescope")
 @option("--controller", metavar="NPZ", help="Learn a predictive controller as well, and write it to a file.")
-@option("--output", "-o", metavar="HTML", help="Page to write.", show_default="FILE's or NAME's, with .html")
+@option("--output", "-o", metavar="HTML", help="Page to write.", show_default="FILE's, with .html")
 def command(
-    recording: Path | None,
-    engine: str | None,
-    seconds: float | None,
+    recording: Path,
     system: str | None,
     config: str | None,
     strehl: str | None,
@@ -114,7 +103,6 @@ def command(
 
     \b
     Examples:
-      faintspot telemetry --engine faintspot --seconds 20
       faintspot telemetry night.zarr
       faintspot telemetry night.zarr --strehl times.csv
       faintspot telemetry slopes.zarr --frame-rate-hz 250 --every 60
@@ -124,41 +112,30 @@ def command(
       faintspot telemetry loop.toml -o loop.html
       faintspot telemetry loop.npz --controller controller.npz
     """
-    from faintspot.loop.telemetry.page import page_of_loop, table_of_pieces
+    page = derived(recording, ".html") if output is None else Path(output)
+    if not one_loop and controller is None and _alternates(recording):
+        _report_night(recording, page, config, system, strehl, settle)
+        return
+    if strehl is not None or settle is not None:
+        raise InputError(
+            f"{recording}: --strehl and --settle: expected methods that alternated in a closed loop"
+        )
     from faintspot.loop.telemetry.recorded_loop import read_recorded_loop
-    from faintspot.loop.telemetry.report import report_of_loop
 
-    if engine is None and recording is None:
-        raise click.UsageError("expected FILE or --engine")
-    if engine is None and seconds is not None:
-        raise click.UsageError("--seconds: expected --engine as well")
-    if engine is not None:
-        require_linux("telemetry --engine")
-        require("realtime", "zarr", purpose="telemetry --engine")
-    page = Path(output) if output is not None else derived(recording or f"{engine}", ".html")
-    with ExitStack() as temporary:
-        if engine is not None:
-            if recording is None:
-                recording = Path(temporary.enter_context(tempfile.TemporaryDirectory()), f"{engine}.zarr")
-            from faintspot.loop.control.configuration import load_control
-
-            config = config or "faintspot.toml"
-            load_control(config)  # faults of the file are found before the recording
-            _record(engine, recording, _SECONDS if seconds is None else seconds)
-        recording = not_none(recording)
-        alternated = not one_loop and controller is None and _alternates(recording)
-        if alternated:
-            _report_night(recording, page, config, system, strehl, settle)
-            return
-        if strehl is not None or settle is not None:
-            raise InputError(
-                f"{recording}: --strehl and --settle: expected methods that alternated in a closed loop"
-            )
-        given = {name: value for name, value in stated.items() if value is not None}
-        loop = read_recorded_loop(recording, system, config, given)
+    given = {name: value for name, value in stated.items() if value is not None}
+    loop = read_recorded_loop(recording, system, config, given)
     if controller is not None and not loop.is_closed:
         raise InputError("--controller: expected the recording of a closed loop, got an open one")
-    pieces = [] if every is None else _over_time(loop, every)
+    report = _report_loop(loop, page, [] if every is None else _over_time(loop, every))
+    if controller is not None:
+        _learn(loop, report.observed, controller)
+
+
+def _report_loop(loop: Recording, page: Path, pieces: list[Piece]) -> LoopReport:
+    """Write the page and the numbers of a loop."""
+    from faintspot.loop.telemetry.page import page_of_loop, table_of_pieces
+    from faintspot.loop.telemetry.report import report_of_loop
+
     report = report_of_loop(loop, lambda step: click.echo(f"{step} ...", err=True))
     numbers = derived(page, ".json")
     write_atomically(numbers, to_json(report.as_values(), indent=1))
@@ -167,20 +144,21 @@ def command(
         table = derived(page, "-over-time.csv")
         write_atomically(table, table_of_pieces(pieces))
         click.echo(table)
-    for remark in report.loop.remarks:
-        click.echo(remark)
-    if report.advice:
-        click.echo(report.advice)
+    for line in filter(None, (*report.loop.remarks, report.advice)):
+        click.echo(line)
     click.echo(f"{page}: open it in a browser; {numbers} has the numbers")
-    if controller is not None:
-        from faintspot.loop.control.identification.predictive_control import PredictiveControl, learn
+    return report
 
-        click.echo("controller ...", err=True)
-        with errors_within(f"{controller}: not written, keep the integrator"):
-            bare = replace(loop, remarks=())
-            control = learn(bare) if report.observed is None else PredictiveControl.of(report.observed)
-        control.save(controller)
-        click.echo(f"{controller}: {control.summary()}")
+
+def _learn(loop: Recording, observed: ObservedLoop | None, controller: str) -> None:
+    """Learn a controller from a loop, and write it."""
+    from faintspot.loop.control.identification.predictive_control import PredictiveControl, learn
+
+    click.echo("controller ...", err=True)
+    with errors_within(f"{controller}: not written, keep the integrator"):
+        control = learn(replace(loop, remarks=())) if observed is None else PredictiveControl.of(observed)
+    control.save(controller)
+    click.echo(f"{controller}: {control.summary()}")
 
 
 def _alternates(recording: Path) -> bool:
@@ -228,15 +206,3 @@ def _over_time(loop: Recording, every_s: float) -> list[Piece]:
 
     with progress_bar("pieces", "pieces") as advance:
         return turbulence_over_time(loop, every_s, advance)
-
-
-def _record(engine: str, store: Path, seconds: float) -> None:
-    """Record a running engine to a new store."""
-    from faintspot.cli.realtime.control import record_engine, recording_summary
-
-    if store.suffix != ".zarr":
-        raise InputError(f"{store}: expected a name that ends in .zarr, for the recording of --engine")
-    report = record_engine(engine, store, None, seconds)
-    click.echo(f"{engine}: {recording_summary(report)}", err=True)
-    if not report.frames:
-        raise InputError(f"{engine}: no frames in {report.seconds:.1f} s; start its source of frames")

@@ -253,23 +253,19 @@ def record(out: Path, name: str, frames: int | None, seconds: float | None) -> N
     """
     if out.suffix != ".zarr":
         raise InputError(f"{out}: expected a name that ends in .zarr")
-    click.echo(f"{out}: {recording_summary(record_engine(name, out, frames, seconds))}")
-
-
-def record_engine(name: str, store: Path, frames: int | None, seconds: float | None) -> RecordingReport:
-    """Record a running engine to a new store, with a progress bar, until a limit or Ctrl-C."""
     from faintspot.cli.output import progress_bar
     from faintspot.engine.telemetry.recorder import Recorder
 
-    recorder = Recorder(name, store)
+    recorder = Recorder(name, out)
     total: Any = frames  # None, where it is not known, makes the bar a moving one
-    with stop_on_signal() as stop, progress_bar(store.name) as advance:
-        return recorder.run(
+    with stop_on_signal() as stop, progress_bar(out.name) as advance:
+        report = recorder.run(
             n_frames=frames, seconds=seconds, stop=stop, progress=lambda done: advance(done, total)
         )
+    click.echo(f"{out}: {_summary(report)}")
 
 
-def recording_summary(report: RecordingReport) -> str:
+def _summary(report: RecordingReport) -> str:
     """Describe what was recorded and what was lost."""
     ended = {
         "frames": "all that were asked for",
