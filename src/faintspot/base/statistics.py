@@ -57,6 +57,12 @@ class Estimate:
         return Estimate(value, math.hypot(self.standard_error, error), low, high, self.count)
 
     @property
+    def in_sigmas(self) -> float:
+        """The value in units of its standard error; NaN where it has none."""
+        error = self.standard_error
+        return self.value / error if math.isfinite(error) and error > 0 else math.nan
+
+    @property
     def decided(self) -> int:
         """1 when the whole interval is above 0, -1 when it is below, else 0."""
         return int(self.low > 0) - int(self.high < 0)
@@ -159,11 +165,10 @@ def _gain_and_corrected_rms(
     estimate: NDArray[np.float64], truth: NDArray[np.float64]
 ) -> tuple[Estimate, Estimate]:
     """Regression of (n, 2) estimates on the truth: its gain, and the rms of its residuals over the gain."""
-    undefined = Estimate(float("nan"), float("nan"))
     centred = truth - truth.mean(axis=0)
     spread = float(np.mean(np.square(centred)))
     if spread == 0.0:
-        return undefined, undefined
+        return UNKNOWN, UNKNOWN
     deviation = estimate - estimate.mean(axis=0)
     gain = float(np.mean(deviation * centred)) / spread
     residual = deviation - gain * centred
@@ -199,7 +204,7 @@ def paired_mean(differences: ArrayLike, comparisons: int = 1) -> Estimate:
     values = values[np.isfinite(values)]
     count = len(values)
     if count == 0:
-        return Estimate(math.nan)
+        return UNKNOWN
     mean = float(values.mean())
     if count < 2:
         return Estimate(mean, count=count)

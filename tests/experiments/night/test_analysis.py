@@ -25,7 +25,7 @@ from faintspot.experiments.night.analysis import (
 
 def test_groups_leave_a_strength_of_zero_out() -> None:
     night = night_with()
-    found = {group.name: group.rows for group in groups(night)}
+    found = groups(night)
     assert list(found) == [ALL_STRENGTHS, BEST]
     assert (night.strength[found[ALL_STRENGTHS]] > 0).all()
     assert night.strength[found[BEST]].min() >= 0.6
@@ -41,7 +41,7 @@ def test_a_method_without_strength_is_a_group_of_its_own() -> None:
     strength = np.where(night.strength == 0, np.nan, night.strength)
     settings = (*night.settings, "")
     changed = replace(night, labels=labels, settings=settings, method=method, strength=strength)
-    assert [group.name for group in groups(changed)] == [ALL_STRENGTHS, BEST, "fixed window"]
+    assert list(groups(changed)) == [ALL_STRENGTHS, BEST, "fixed window"]
 
 
 @pytest.mark.parametrize("effect", [0.12, -0.12])

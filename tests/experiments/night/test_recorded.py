@@ -21,7 +21,7 @@ from tests.loop.telemetry.alternation_cases import (
 from tests.refusals import refused
 
 from faintspot.base.report.page import Table
-from faintspot.experiments.night.analysis import difference, drift_of_r0, groups
+from faintspot.experiments.night.analysis import differences
 from faintspot.experiments.night.recorded import (
     alternates,
     page_of_recording,
@@ -81,7 +81,7 @@ def test_the_difference_of_residual_phase_is_found(tmp_path: Path) -> None:
     assert night.labels == ("integrator", "set+integrator")
     assert recorded.settle_frames == (SETTLE, SETTLE)
     assert recorded.gains.gain.tolist() == [1.0, 1.0]  # the same slopes, other controllers
-    assert not recorded.leaning
+    assert not recorded.methods.leaning
     assert recorded.turns == 80
     scored = np.arange(4000) % 50 >= SETTLE
     wave = (2 * np.pi / night.wavelength_m) ** 2
@@ -118,7 +118,7 @@ def test_measured_strehl_ratios(tmp_path: Path) -> None:
     recorded = recorded_night(path, strehl=measured)
     night = recorded.night
     assert night.strength.tolist() == pytest.approx([np.nan, 0.6] * (len(night.strehl) // 2), nan_ok=True)
-    found = difference(night, groups(night)[0], drift_of_r0(night)).measured
+    found = differences(night)[0].measured
     assert found.low < effect < found.high
     assert 0.05 * effect < found.standard_error < effect / 3
     first = night.strehl[0] * recorded.turns_in_block
@@ -136,7 +136,7 @@ def test_intervals_hold_in_drifting_seeing(tmp_path: Path) -> None:
     held = 0
     for seed in range(25):
         night = recorded_night(path, strehl=drifting_strehl(2000, 0.03, seed)).night
-        found = difference(night, groups(night)[0], None).measured
+        found = differences(night)[0].without_r0
         held += found.low < 0.03 < found.high
     assert held >= 21
 
@@ -181,7 +181,7 @@ def test_slopes_that_lean_on_a_prediction(tmp_path: Path) -> None:
     path = stored(tmp_path, alternating(6000, 150), ("map+integrator", "map+kalman"))
     recorded = recorded_night(path)
     assert recorded.settle_frames == (SETTLE, 100)
-    assert recorded.leaning == ("map+kalman",)
+    assert recorded.methods.leaning == ("map+kalman",)
     assert "too small a residual" in text_of_recording(recorded)
 
 

@@ -90,8 +90,8 @@ def with_interval(estimate: Estimate | None, digits: int = 3) -> str:
 
 def in_sigmas(estimate: Estimate, digits: int = 1) -> str:
     """Return a value in units of its standard error, as "+3.1 σ"."""
-    error = estimate.standard_error
-    return f"{signed(estimate.value / error, digits)} σ" if math.isfinite(error) and error > 0 else NOTHING
+    sigmas = estimate.in_sigmas
+    return NOTHING if math.isnan(sigmas) else f"{signed(sigmas, digits)} σ"
 
 
 _OF_NUMBERS: Mapping[str, Callable[[float, int], str]] = {

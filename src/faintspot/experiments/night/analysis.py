@@ -24,15 +24,6 @@ _FEWEST_ROWS = 3
 _FEWEST_SEEN = 10  # blocks with a measured r0
 
 
-@dataclass(frozen=True, eq=False)
-class BlockGroup:
-    """Blocks that are compared with the reference."""
-
-    name: str
-    rows: Rows
-    """(B,)"""
-
-
 @dataclass(frozen=True)
 class Difference:
     """Strehl ratio of a group minus that of the reference."""
@@ -54,9 +45,7 @@ class Difference:
     def hours_needed(self) -> float:
         """Hours of alternating until the effect is `SIGMA` standard errors; of the paired effect if known."""
         effect = self.measured if self.paired is None else self.paired
-        return hours_needed(
-            effect.value, self.measured.standard_error, self.hours, shared_error=self.shared_error
-        )
+        return hours_needed(effect.value, self.measured.standard_error, self.hours, self.shared_error)
 
     @property
     def is_long_enough(self) -> bool:
@@ -78,63 +67,64 @@ class Regression:
     def slope_per_cm(self) -> Estimate:
         """The slope for a centimetre of r0."""
         slope = self.slope_per_m
-        return Estimate(
-            slope.value / 100, slope.standard_error / 100, slope.low / 100, slope.high / 100, slope.count
-        )
+        value, error, low, high = np.array([slope.value, slope.standard_error, slope.low, slope.high]) / 100
+        return Estimate(value, error, low, high, slope.count)
 
 
-def groups(night: Night) -> list[BlockGroup]:
-    """Return what is compared with the reference: all strengths, those of the paper's column, other methods.
+def groups(night: Night) -> dict[str, Rows]:
+    """Return the blocks (B,) that are compared with the reference, by name.
 
-    A strength of 0 changes nothing and belongs to no group.
+    All strengths, those of the paper's column, other methods. A strength of 0 changes nothing and belongs to
+    no group.
     """
-    strength, found = night.strength, []
-    if (strength > 0).any():
-        found.append(BlockGroup(ALL_STRENGTHS, strength > 0))
-        low, high = BEST_STRENGTHS
-        best = (strength >= low) & (strength <= high)
-        if best.any():
-            found.append(BlockGroup(BEST, best))
-    for number, label in enumerate(night.labels):
-        rows = (night.method == number) & np.isnan(strength)
-        if number != night.reference and rows.any():
-            found.append(BlockGroup(label, rows))
-    return found
+    of_tv = {ALL_STRENGTHS: night.strength > 0, BEST: night.strengths_within(*BEST_STRENGTHS)}
+    others = {
+        label: (night.method == number) & np.isnan(night.strength)
+        for number, label in enumerate(night.labels)
+        if number != night.reference
+    }
+    return {name: rows for name, rows in (of_tv | others).items() if rows.any()}
+
+
+def with_reference(night: Night) -> dict[str, Rows]:
+    """Return the blocks of the reference and of each group, by name."""
+    return {night.labels[night.reference]: night.is_reference, **groups(night)}
 
 
 def differences(night: Night) -> list[Difference]:
     """Return the difference of each group from the reference."""
     seeing = drift_of_r0(night)
-    return [difference(night, group, seeing) for group in groups(night)]
+    return [difference(night, name, chosen, seeing) for name, chosen in groups(night).items()]
 
 
-def difference(night: Night, group: BlockGroup, seeing: Floats | None) -> Difference:
-    """Return the difference of a group from the reference.
+def difference(night: Night, name: str, chosen: Rows, seeing: Floats | None) -> Difference:
+    """Return the difference of some blocks from the reference.
 
     Parameters
     ----------
     night : Night
-    group : BlockGroup
+    name : str
+    chosen : (B,) array of bool
     seeing : (B,) array, optional
         See `drift_of_r0`.
     """
-    reference = night.method == night.reference
-    rows = (reference | group.rows) & np.isfinite(night.strehl)
+    reference = night.is_reference
+    rows = (reference | chosen) & np.isfinite(night.strehl)
     paired = None
-    known = group.rows & np.isfinite(night.paired_strehl - night.strehl)
+    known = chosen & np.isfinite(night.paired_strehl - night.strehl)
     if known.any():
         change = (night.strehl - night.paired_strehl)[known]
         one = np.ones((len(change), 1))
         paired = coefficient(one, change, night.middle_s[known], night.cycle[known], 0)
     seconds = night.duration_s[rows] + night.overhead_s
     return Difference(
-        group.name,
-        int(group.rows.sum()),
-        contrast(night, group.rows, reference, seeing),
-        contrast(night, group.rows, reference, None),
+        name,
+        int(chosen.sum()),
+        contrast(night, chosen, reference, seeing),
+        contrast(night, chosen, reference, None),
         paired,
         float(seconds.sum()) / 3600,
-        _shared_error(night, group.rows & rows, reference & rows),
+        _shared_error(night, chosen & rows, reference & rows),
     )
 
 
@@ -146,10 +136,7 @@ def contrast(night: Night, chosen: Rows, others: Rows, seeing: Floats | None) ->
     rows = (chosen | others) & np.isfinite(night.strehl)
     if min((chosen & rows).sum(), (others & rows).sum()) < _FEWEST_ROWS:
         return UNKNOWN
-    columns = [chosen[rows].astype(np.float64)]
-    columns += [
-        (night.set_number[rows] == number).astype(np.float64) for number in range(len(night.set_names))
-    ]
+    columns = [part[rows].astype(np.float64) for part in (chosen, *night.sets)]
     if seeing is not None:
         away = seeing[rows] - seeing[rows].mean()
         columns += [away, away**2 - np.mean(away**2)]
@@ -182,25 +169,24 @@ def drift_of_r0(night: Night) -> Floats | None:
 def by_strength(night: Night) -> list[tuple[float, Difference]]:
     """Return the mean strength and the difference from the reference of each range of strengths."""
     seeing, strength, found = drift_of_r0(night), night.strength, []
-    low_best, high_best = BEST_STRENGTHS
-    best = (strength >= low_best) & (strength <= high_best)
+    best = night.strengths_within(*BEST_STRENGTHS)
     for low, high in STRENGTH_RANGES:
-        rows = best if low == low_best else (strength > low) & (strength <= high) & ~best
+        rows = best if (low, high) == BEST_STRENGTHS else (strength > low) & (strength <= high) & ~best
         if rows.sum() >= _FEWEST_ROWS:
             name = f"{low:g} to {high:g}" if math.isfinite(high) else f"above {low:g}"
-            group = BlockGroup(f"{name} {night.strength_unit}", rows)
-            found.append((float(strength[rows].mean()), difference(night, group, seeing)))
+            compared = difference(night, f"{name} {night.strength_unit}", rows, seeing)
+            found.append((float(strength[rows].mean()), compared))
     return found
 
 
 def lines(night: Night) -> list[Regression]:
     """Return Strehl ratio against measured r0 as a line, for the reference and each group."""
-    every = [BlockGroup(night.labels[night.reference], night.method == night.reference), *groups(night)]
-    return [line for group in every if (line := _line(night, group)) is not None]
+    every = with_reference(night).items()
+    return [line for name, chosen in every if (line := _line(night, name, chosen)) is not None]
 
 
-def _line(night: Night, group: BlockGroup) -> Regression | None:
-    rows = group.rows & np.isfinite(night.r0_m + night.strehl)
+def _line(night: Night, name: str, chosen: Rows) -> Regression | None:
+    rows = chosen & np.isfinite(night.r0_m + night.strehl)
     r0, strehl = night.r0_m[rows], night.strehl[rows]
     if len(r0) < _FEWEST_ROWS or np.ptp(r0) == 0 or np.ptp(strehl) == 0:
         return None
@@ -212,13 +198,11 @@ def _line(night: Night, group: BlockGroup) -> Regression | None:
         if np.unique(r0[cycle != number]).size > 1
     ]
     correlation = float(np.corrcoef(r0, strehl)[0, 1])
-    return Regression(group.name, jackknife(float(slope), without), float(intercept), correlation, len(r0))
+    return Regression(name, jackknife(float(slope), without), float(intercept), correlation, len(r0))
 
 
-def hours_needed(
-    effect: float, error: float, hours: float, sigma: float = SIGMA, *, shared_error: float = 0.0
-) -> float:
-    """Return the hours after which an effect is `sigma` standard errors, whose square falls with time.
+def hours_needed(effect: float, error: float, hours: float, shared_error: float = 0.0) -> float:
+    """Return the hours after which an effect is `SIGMA` standard errors, whose square falls with time.
 
     Infinite where no time is long enough.
 
@@ -228,28 +212,20 @@ def hours_needed(
     error : float
         Its standard error after `hours`.
     hours : float
-    sigma : float
     shared_error : float
         Part of the error that does not fall with time.
     """
     if not (math.isfinite(effect) and math.isfinite(error)):
         return math.nan
-    left = (effect / sigma) ** 2 - shared_error**2
+    left = (effect / SIGMA) ** 2 - shared_error**2
     return hours * max(error**2 - shared_error**2, 0.0) / left if left > 0 else math.inf
-
-
-def significance(estimate: Estimate) -> float:
-    """Return a value in units of its standard error; NaN where it has none."""
-    error = estimate.standard_error
-    return estimate.value / error if math.isfinite(error) and error > 0 else math.nan
 
 
 def group_means(night: Night, rows: Rows) -> list[tuple[float, float, int]]:
     """Return mean, standard deviation and number of some blocks in each set, and in all of them."""
     found = []
-    for number in [*range(len(night.set_names)), None]:
-        part = rows & (np.ones_like(rows) if number is None else night.set_number == number)
-        values = night.strehl[part & np.isfinite(night.strehl)]
+    for part in (*night.sets, np.ones_like(rows)):
+        values = night.strehl[rows & part & np.isfinite(night.strehl)]
         scatter = float(values.std(ddof=1)) if len(values) > 1 else math.nan
         found.append((float(values.mean()) if len(values) else math.nan, scatter, len(values)))
     return found
@@ -291,7 +267,7 @@ class NightVerdict:
     @property
     def significance(self) -> float:
         """The measured effect in standard errors."""
-        return significance(self.measured)
+        return self.measured.in_sigmas
 
 
 def verdicts(night: Night) -> list[NightVerdict]:
@@ -299,7 +275,7 @@ def verdicts(night: Night) -> list[NightVerdict]:
 
     A statement holds where the whole 95 % interval is above 0, and does not hold where it is below.
     """
-    found = {group.name: group.rows for group in groups(night)}
+    found = groups(night)
     if ALL_STRENGTHS not in found:
         return []
     seeing = drift_of_r0(night)

@@ -25,6 +25,7 @@ from faintspot.experiments.night.analysis import (
     groups,
     lines,
     verdicts,
+    with_reference,
 )
 from faintspot.experiments.night.paper import (
     PAPER_CORRELATION,
@@ -75,19 +76,16 @@ def panels_figure(night: Night) -> page.FigureWithData:
 def _shown(night: Night) -> dict[str, tuple[NDArray[np.bool_], dict[str, object]]]:
     """Return blocks and style of what is drawn, by name; each block once, the reference last."""
     every = groups(night)
-    best = next((group.rows for group in every if group.name == BEST), np.zeros(len(night.strehl), np.bool_))
-    shown: dict[str, tuple[NDArray[np.bool_], dict[str, Any]]] = {}
-    others = [group for group in every if group.name not in _TV_STYLES]
-    for group in every:
-        if group.name == ALL_STRENGTHS and best.any():
-            shown["TV, other strengths"] = group.rows & ~best, _TV_STYLES[group.name]
-        elif group in others:
-            index = others.index(group)
-            style = {"color": METHOD_COLOURS[1 + index % 3], "marker": _MARKERS[index % len(_MARKERS)]}
-            shown[group.name] = group.rows, style
-        else:
-            shown[group.name] = group.rows, _TV_STYLES[group.name]
-    return shown | {night.labels[night.reference]: (night.method == night.reference, _REFERENCE_STYLE)}
+    others = [name for name in every if name not in _TV_STYLES]
+    styles = _TV_STYLES | {
+        name: {"color": METHOD_COLOURS[1 + index % 3], "marker": _MARKERS[index % len(_MARKERS)]}
+        for index, name in enumerate(others)
+    }
+    shown = {name: (rows, styles[name]) for name, rows in every.items()}
+    if BEST in every:
+        rows, style = shown.pop(ALL_STRENGTHS)
+        shown = {"TV, other strengths": (rows & ~every[BEST], style), **shown}
+    return shown | {night.labels[night.reference]: (night.is_reference, _REFERENCE_STYLE)}
 
 
 def _points(
@@ -146,7 +144,7 @@ def _of_strengths(
     night: Night, shown: dict[str, tuple[NDArray[np.bool_], dict[str, object]]], bottom: dict[str, Any]
 ) -> Panel:
     """Return blocks against strength, and the ranges at the height of the reference plus their difference."""
-    reference = night.strehl[night.method == night.reference]
+    reference = night.strehl[night.is_reference]
     mean, scatter = float(np.nanmean(reference)), float(np.nanstd(reference))
     strengths = night.strength[night.strength > 0]
     across, height = [strengths.min(), strengths.max()], [mean, mean]
@@ -219,7 +217,7 @@ def night_summary(night: Night) -> dict[str, Any]:
                 {"set": where, **dict(zip(_MEAN, map(plain, values), strict=True))}
                 for where, values in zip(sets, group_means(night, rows), strict=True)
             ]
-            for name, rows in _compared(night).items()
+            for name, rows in with_reference(night).items()
         },
         "differences": [plain_record(each, _DIFFERENCE) for each in differences(night)],
         "by_strength": [
@@ -302,14 +300,8 @@ def _length(difference: Difference) -> str:
     return "long_enough" if difference.is_long_enough else "too_short"
 
 
-def _compared(night: Night) -> dict[str, Any]:
-    """Return the blocks of the reference and of each group, by name."""
-    reference = {night.labels[night.reference]: night.method == night.reference}
-    return reference | {group.name: group.rows for group in groups(night)}
-
-
 def _means_table(night: Night) -> page.Table:
-    named = _compared(night)
+    named = with_reference(night)
     columns = [group_means(night, rows) for rows in named.values()]
     rows: list[list[str | page.TableCell]] = []
     for row, where in enumerate([*night.set_names, "all sets"]):

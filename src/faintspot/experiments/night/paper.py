@@ -72,15 +72,13 @@ class PaperComparison:
 
 def set_columns(night: Night) -> list[list[NDArray[np.bool_]]]:
     """Return the blocks of each set, of each column of Table 1; a strength of 0 changes nothing."""
-    low, high = BEST_STRENGTHS
-    best = (night.strength >= low) & (night.strength <= high)
-    columns = night.method == night.reference, night.strength > 0, best
-    return [[rows & column & np.isfinite(night.strehl) for column in columns] for rows in _sets(night)]
+    columns = night.is_reference, night.strength > 0, night.strengths_within(*BEST_STRENGTHS)
+    return [[rows & column & np.isfinite(night.strehl) for column in columns] for rows in night.sets]
 
 
-def paper_exposures(plan: NightPlan | None = None) -> NDArray[np.int64]:
+def paper_exposures() -> NDArray[np.int64]:
     """Return the number of exposures of each set and column of the paper's protocol, (sets, 3)."""
-    plan, (low, high) = plan or NightPlan(), BEST_STRENGTHS
+    plan, (low, high) = NightPlan(), BEST_STRENGTHS
     counts = []
     for number, repeats in enumerate(plan.repeats):
         strengths = np.array([strength for name, strength in plan.entries(number) if name == TV])
@@ -177,8 +175,7 @@ def chances_without_difference(
 
     def excess(chosen: NDArray[np.bool_]) -> Floats:
         """Return the mean difference of the sets that have such blocks, (nights,)."""
-        reference = night.method == night.reference
-        pairs = [(part & chosen, part & reference) for part in _sets(night)]
+        pairs = [(part & chosen, part & night.is_reference) for part in night.sets]
         of_sets = [
             strehl[:, some].mean(axis=1) - strehl[:, others].mean(axis=1)
             for some, others in pairs
@@ -187,8 +184,8 @@ def chances_without_difference(
         return np.asarray(np.mean(of_sets, axis=0))
 
     low, high = BEST_STRENGTHS
-    best = excess((night.strength >= low) & (night.strength <= high))
-    ranges = [(night.strength >= end) & (night.strength <= end + high - low + 1e-9) for end in _RANGES]
+    best = excess(night.strengths_within(low, high))
+    ranges = [night.strengths_within(end, end + high - low + 1e-9) for end in _RANGES]
     largest = np.max([best, *(excess(rows) for rows in ranges if rows.any())], axis=0)
     every = excess(night.strength > 0)
     shares = every >= excesses[0], best >= excesses[1], largest >= excesses[1]
@@ -212,14 +209,10 @@ def _synthetic_strehl(night: Night, nights: int, rng: np.random.Generator) -> Fl
     span = time[-1] + np.median(np.diff(time))
     away = np.interp((time + span * rng.random((nights, 1))) % span, time, drift)
     strehl: Floats = away * fit[-2] + away**2 * fit[-1]
-    of_drift = float(np.mean([strehl[:, part].var(axis=1) for part in _sets(night)]))
+    of_drift = float(np.mean([strehl[:, part].var(axis=1) for part in night.sets]))
     counts = paper_exposures()[:, :2]
     of_paper = float(((counts - 1) * PAPER_SCATTERS[:, :2] ** 2).sum() / (counts - 1).sum())
     part = min(of_drift, PAPER_CORRELATION**2 * of_paper)
     strehl *= math.sqrt(part / of_drift) if of_drift > 0 else 0.0
     scale = math.sqrt(max(of_paper - part, variance) / np.mean(residual**2))
     return strehl + scale * rng.choice(residual, strehl.shape)
-
-
-def _sets(night: Night) -> list[NDArray[np.bool_]]:
-    return [night.set_number == number for number in range(len(night.set_names))]

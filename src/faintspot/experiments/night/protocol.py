@@ -15,6 +15,7 @@ from faintspot.base.files import output_errors
 from faintspot.base.options import LIST, TEXTS, Options, number, setting
 from faintspot.experiments.closed_loop.results import with_choice
 from faintspot.io.stored_array import one_line
+from faintspot.io.zarr_store import new_store
 from faintspot.loop.control.base import INTEGRATOR
 from faintspot.loop.simulation.configuration import LoopConfiguration
 from faintspot.loop.simulation.methods import UNCORRECTED, Method
@@ -189,7 +190,6 @@ Floats = NDArray[np.float64]
 NIGHT_STORE = "night.zarr"
 """Name of the store in a folder of results."""
 _FORMAT = 1
-_AXIS = "block"
 
 
 @dataclass(frozen=True, eq=False)
@@ -250,12 +250,9 @@ class Night:
 
     def __post_init__(self) -> None:
         count = len(self.start_s)
-        for item in fields(self):
-            value = getattr(self, item.name)
-            if isinstance(value, np.ndarray) and value.shape != (count,):
-                raise InputError(
-                    f"{item.name}: expected a value for each of {count} blocks, got {value.shape}"
-                )
+        for name, value in self._arrays().items():
+            if value.shape != (count,):
+                raise InputError(f"{name}: expected a value for each of {count} blocks, got {value.shape}")
         for name, numbers, limit in (
             ("method", self.method, len(self.labels)),
             ("set_number", self.set_number, len(self.set_names)),
@@ -276,6 +273,20 @@ class Night:
         return float((self.duration_s + self.overhead_s).sum()) / 3600
 
     @property
+    def is_reference(self) -> NDArray[np.bool_]:
+        """(B,): whether the reference measured a block."""
+        return np.equal(self.method, self.reference)
+
+    @property
+    def sets(self) -> list[NDArray[np.bool_]]:
+        """(B,) for each set: its blocks."""
+        return [self.set_number == number for number in range(len(self.set_names))]
+
+    def strengths_within(self, low: float, high: float) -> NDArray[np.bool_]:
+        """Return the blocks with strengths in a range, ends included, (B,)."""
+        return (self.strength >= low) & (self.strength <= high)
+
+    @property
     def has_strengths(self) -> bool:
         """Whether there are blocks with TV."""
         return bool((self.strength > 0).any())
@@ -289,7 +300,7 @@ class Night:
     def cycle(self) -> NDArray[np.int64]:
         """(B,): number of the cycle, which begins with each block of the reference and each set."""
         new_set = np.diff(self.set_number, prepend=self.set_number[:1] - 1) != 0
-        return np.cumsum(new_set | (self.method == self.reference)) - 1
+        return np.cumsum(new_set | self.is_reference) - 1
 
     def save(self, path: str | Path) -> None:
         """Write the night as a Zarr store, which xarray opens with one dimension, `block`.
@@ -301,27 +312,16 @@ class Night:
         MissingExtraError
             When zarr is not installed.
         """
-        path, zarr = Path(path), load_package("zarr")
-        hidden = path.with_name(f".{path.name}.new")
-        attributes = {
-            item.name: list(value) if isinstance(value, tuple) else value
-            for item in fields(self)
-            if not isinstance(value := getattr(self, item.name), np.ndarray)
-        }
-        with output_errors(path):
-            shutil.rmtree(hidden, ignore_errors=True)
-            group = zarr.create_group(
-                str(hidden), zarr_format=3, attributes={"night_format": _FORMAT, **attributes}
-            )
-            for name, values in self._columns().items():
-                group.create_array(name, data=values, dimension_names=(_AXIS,))
+        path, arrays = Path(path), self._arrays()
+        others = {name: value for name, value in vars(self).items() if name not in arrays}
+        with output_errors(path), new_store(path, {"night_format": _FORMAT, **others}) as group:
+            for name, values in arrays.items():
+                group.create_array(name, data=values, dimension_names=("block",))
             shutil.rmtree(path, ignore_errors=True)
-            hidden.rename(path)
 
-    def _columns(self) -> dict[str, NDArray[np.generic]]:
+    def _arrays(self) -> dict[str, NDArray[np.generic]]:
         """Return the arrays by name."""
-        values = {item.name: getattr(self, item.name) for item in fields(self)}
-        return {name: value for name, value in values.items() if isinstance(value, np.ndarray)}
+        return {name: value for name, value in vars(self).items() if isinstance(value, np.ndarray)}
 
 
 def load_night(path: str | Path) -> Night:

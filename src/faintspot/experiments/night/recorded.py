@@ -57,9 +57,8 @@ class RecordedNight:
     """A night with how its blocks were made."""
 
     night: Night
+    methods: RecordedMethods
     gains: RelativeGains
-    centroid_gain: float
-    """Stated in [control]: the mean of all methods."""
     settle_frames: tuple[int, ...]
     """(methods,): frames at the beginning of a turn that are not scored."""
     turns: int
@@ -68,8 +67,6 @@ class RecordedNight:
     """Whether Strehl ratios were measured, not estimated from slopes."""
     shared_phase_error_rad2: Floats
     """(B,): as `Night.shared_error`, of the residual phase."""
-    leaning: tuple[str, ...]
-    """Methods whose slopes lean on a prediction, so that they show too small a residual."""
 
 
 def alternates(path: str | Path) -> bool:
@@ -168,10 +165,9 @@ def _night(
 ) -> RecordedNight:
     settle = [frames if settle_frames is None else settle_frames for frames in methods.settle_frames]
     turns = turns_of(loop, settle)
-    _check(loop, turns, methods, settle)
+    _check(turns, methods, settle)
     relative = relative_gains(loop, turns, methods.groups, methods.reference)
-    stated, names = methods.centroid_gain, conditions_of(telemetry)[1]
-    gains = stated * relative.gain / math.exp(float(np.log(relative.gain).mean()))
+    gains = methods.centroid_gain * relative.gain / math.exp(float(np.log(relative.gain).mean()))
     found = [_Scored.of(loop, turn, float(gains[turn.method]), strehl) for turn in turns]
     kept = [scored for scored in found if scored is not None]
     if not kept:
@@ -198,7 +194,7 @@ def _night(
         labels=methods.labels,
         settings=methods.settings,
         reference=methods.reference,
-        set_names=tuple(names[number] for number in conditions),
+        set_names=tuple(conditions_of(telemetry)[1][number] for number in conditions),
         set_number=numbers,
         strength=np.array(methods.strength_e)[arrays["method"]],
         true_r0_m=unknown,
@@ -209,13 +205,11 @@ def _night(
         configuration="",
         **arrays,
     )
-    made = len(kept), together, strehl is not None, shared_phase, methods.leaning
-    return RecordedNight(night, relative, stated, tuple(settle), *made)
+    made = len(kept), together, strehl is not None, shared_phase
+    return RecordedNight(night, methods, relative, tuple(settle), *made)
 
 
-def _check(
-    loop: AlternatingLoop, turns: Sequence[Turn], methods: RecordedMethods, settle: Sequence[int]
-) -> None:
+def _check(turns: Sequence[Turn], methods: RecordedMethods, settle: Sequence[int]) -> None:
     """Refuse a recording without a few turns of each method."""
     for number, label in enumerate(methods.labels):
         count = sum(turn.method == number for turn in turns)
@@ -346,7 +340,7 @@ def summary_of_recording(recorded: RecordedNight) -> dict[str, object]:
         **night_summary(night),
         "strehl": "measured" if recorded.is_measured else "estimated from slopes",
         "phase_rad2": [plain_record(each, ("name", "measured")) for each in phase_differences(recorded)],
-        "centroid_gain_of_control": recorded.centroid_gain,
+        "centroid_gain_of_control": recorded.methods.centroid_gain,
         "relative_centroid_gain": {
             label: {"value": plain(gain), "standard_error": plain(error)}
             for label, gain, error in zip(
@@ -400,5 +394,5 @@ def _remarks(recorded: RecordedNight) -> list[str]:
         "remarks",
         measured=recorded.is_measured,
         unknown=", ".join(unknown) or None,
-        leaning=", ".join(recorded.leaning) or None,
+        leaning=", ".join(recorded.methods.leaning) or None,
     )
