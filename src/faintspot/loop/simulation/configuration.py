@@ -21,8 +21,6 @@ from faintspot.slopes.estimators.sensor import Scene
 from faintspot.slopes.simulate.photometry import Photometry
 from faintspot.slopes.spots.shapes import R0_WAVELENGTH_M
 
-"""Radians in one arcsecond."""
-
 SPOT_FWHM = 0.886  # full width at half maximum of sinc^2, in lambda / d
 _MOST_POINTS = 4096**2  # of a wavefront
 _POINT_FIELD = 0.9  # of a window that holds a laser guide star
