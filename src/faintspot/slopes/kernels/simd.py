@@ -127,11 +127,17 @@ _register_binary(operator.le, lambda b, x, y: b.fcmp_ordered("<=", x, y), True)
 # Memory ----------------------------------------------------------------------------------------------
 
 
-def _element_pointer(
-    context: Any, builder: Any, array_type: Any, array: Any, offset: Any, vector: Vector
-) -> Any:
-    data = context.make_array(array_type)(context, builder, array).data
-    pointer = builder.gep(data, [offset])
+def _element(context: Any, builder: Any, sig: Any, args: Any, array: int) -> Any:
+    """Return the pointer to an element of an array, whose offset is the argument after it."""
+    offset = context.cast(builder, args[array + 1], sig.args[array + 1], types.intp)
+    return builder.gep(_data(context, builder, sig, args, array), [offset])
+
+
+def _data(context: Any, builder: Any, sig: Any, args: Any, array: int) -> Any:
+    return context.make_array(sig.args[array])(context, builder, args[array]).data
+
+
+def _vectors(builder: Any, pointer: Any, vector: Vector) -> Any:
     return builder.bitcast(pointer, _llvm_vector(vector).as_pointer())
 
 
@@ -148,14 +154,13 @@ def copy_transposed(
     kind = source.dtype
 
     def emit(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        data, first = (context.make_array(sig.args[k])(context, builder, args[k]).data for k in (1, 2))
-        offset = context.cast(builder, args[3], sig.args[3], types.intp)
-        rows = []
+        data, first = (_data(context, builder, sig, args, k) for k in (1, 2))
+        offset, rows = context.cast(builder, args[3], sig.args[3], types.intp), []
         for lane in range(lanes.width):
             start = builder.load(builder.gep(first, [ir.IntType(64)(lane)]))
-            rows.append(_load_widened(context, builder, data, builder.add(start, offset), kind, vector))
-        place = context.cast(builder, args[5], sig.args[5], types.intp)
-        pointer = _element_pointer(context, builder, sig.args[4], args[4], place, vector)
+            pointer = builder.gep(data, [builder.add(start, offset)])
+            rows.append(_load_widened(context, builder, pointer, kind, vector))
+        pointer = _vectors(builder, _element(context, builder, sig, args, 4), vector)
         for lane, values in enumerate(_transposed(builder, rows)):
             builder.store(
                 values, builder.gep(pointer, [ir.IntType(64)(lane)]), align=lanes.scalar.bitwidth // 8
@@ -187,8 +192,7 @@ def load(typing_context: Any, lanes: Any, array: Any, offset: Any) -> Any:
     vector = Vector(lanes.scalar, lanes.width)
 
     def emit(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        place = context.cast(builder, args[2], sig.args[2], types.intp)
-        pointer = _element_pointer(context, builder, sig.args[1], args[1], place, vector)
+        pointer = _vectors(builder, _element(context, builder, sig, args, 1), vector)
         return builder.load(pointer, align=lanes.scalar.bitwidth // 8)
 
     return vector(lanes, array, offset), emit
@@ -197,20 +201,18 @@ def load(typing_context: Any, lanes: Any, array: Any, offset: Any) -> Any:
 @intrinsic
 def widened(typing_context: Any, lanes: Any, array: Any, offset: Any) -> Any:
     """Load W consecutive unsigned integers, or numbers of the lanes' own type, as the latter."""
-    vector, kind = Vector(lanes.scalar, lanes.width), array.dtype
+    vector = Vector(lanes.scalar, lanes.width)
 
     def emit(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        place = context.cast(builder, args[2], sig.args[2], types.intp)
-        data = context.make_array(sig.args[1])(context, builder, args[1]).data
-        return _load_widened(context, builder, data, place, kind, vector)
+        pointer = _element(context, builder, sig, args, 1)
+        return _load_widened(context, builder, pointer, array.dtype, vector)
 
     return vector(lanes, array, offset), emit
 
 
-def _load_widened(context: Any, builder: Any, data: Any, place: Any, kind: Any, vector: Vector) -> Any:
+def _load_widened(context: Any, builder: Any, pointer: Any, kind: Any, vector: Vector) -> Any:
     packed = ir.VectorType(context.get_data_type(kind), vector.width)
-    pointer = builder.bitcast(builder.gep(data, [place]), packed.as_pointer())
-    values = builder.load(pointer, align=kind.bitwidth // 8)
+    values = builder.load(builder.bitcast(pointer, packed.as_pointer()), align=kind.bitwidth // 8)
     return values if kind == vector.scalar else builder.uitofp(values, _llvm_vector(vector))
 
 
@@ -220,8 +222,7 @@ def gathered(typing_context: Any, lanes: Any, array: Any, places: Any, offset: A
     vector = Vector(lanes.scalar, lanes.width)
 
     def emit(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        data, first = (context.make_array(sig.args[k])(context, builder, args[k]).data for k in (1, 2))
-        start = builder.gep(first, [context.cast(builder, args[3], sig.args[3], types.intp)])
+        data, start = _data(context, builder, sig, args, 1), _element(context, builder, sig, args, 2)
         values = ir.Constant(_llvm_vector(vector), ir.Undefined)
         for lane in range(lanes.width):
             place = builder.load(builder.gep(start, [ir.IntType(64)(lane)]))
@@ -239,8 +240,7 @@ def store(typing_context: Any, array: Any, offset: Any, value: Any) -> Any:
     """Store W consecutive elements of a contiguous array, from element `offset`."""
 
     def emit(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        place = context.cast(builder, args[1], sig.args[1], types.intp)
-        pointer = _element_pointer(context, builder, sig.args[0], args[0], place, value)
+        pointer = _vectors(builder, _element(context, builder, sig, args, 0), value)
         builder.store(args[2], pointer, align=value.scalar.bitwidth // 8)
         return context.get_dummy_value()
 
@@ -253,8 +253,7 @@ def store_all(typing_context: Any, array: Any, offset: Any, values: Any) -> Any:
     vector = values.dtype
 
     def emit(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        place = context.cast(builder, args[1], sig.args[1], types.intp)
-        pointer = _element_pointer(context, builder, sig.args[0], args[0], place, vector)
+        pointer = _vectors(builder, _element(context, builder, sig, args, 0), vector)
         for i in range(values.count):
             value, to = builder.extract_value(args[2], i), builder.gep(pointer, [ir.IntType(64)(i)])
             builder.store(value, to, align=vector.scalar.bitwidth // 8)
@@ -268,9 +267,7 @@ def get(typing_context: Any, array: Any, offset: Any) -> Any:
     """One element of a contiguous array of any number of dimensions, by its flat offset."""
 
     def emit(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        place = context.cast(builder, args[1], sig.args[1], types.intp)
-        data = context.make_array(sig.args[0])(context, builder, args[0]).data
-        return builder.load(builder.gep(data, [place]))
+        return builder.load(_element(context, builder, sig, args, 0))
 
     return array.dtype(array, offset), emit
 
@@ -280,10 +277,8 @@ def put(typing_context: Any, array: Any, offset: Any, value: Any) -> Any:
     """Set one element of a contiguous array, by its flat offset."""
 
     def emit(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        place = context.cast(builder, args[1], sig.args[1], types.intp)
         number = context.cast(builder, args[2], sig.args[2], sig.args[0].dtype)
-        data = context.make_array(sig.args[0])(context, builder, args[0]).data
-        builder.store(number, builder.gep(data, [place]))
+        builder.store(number, _element(context, builder, sig, args, 0))
         return context.get_dummy_value()
 
     return types.void(array, offset, value), emit
@@ -316,6 +311,39 @@ def _call(builder: Any, name: str, vector: Vector, args: Any) -> Any:
     return builder.call(function, args)
 
 
+def _unary(name: str) -> Any:
+    """Return LLVM's function of a vector."""
+
+    @intrinsic
+    def function(typing_context: Any, a: Any) -> Any:
+        return a(a), lambda context, builder, sig, args: _call(builder, name, a, args)
+
+    return function
+
+
+def _extreme(order: str) -> Any:
+    """Return the function of two vectors a and b that chooses a where it is before b, else b."""
+
+    @intrinsic
+    def function(typing_context: Any, a: Any, b: Any) -> Any:
+        def emit(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+            return builder.select(builder.fcmp_ordered(order, *args), *args)
+
+        return a(a, b), emit
+
+    return function
+
+
+square_root = _unary("sqrt")
+"""Correctly rounded square root."""
+rounded = _unary("rint")
+"""The nearest whole number, halves to even."""
+absolute = _unary("fabs")
+"""|a|."""
+maximum, minimum = _extreme(">"), _extreme("<")
+"""The larger or the smaller of a and b; b where either is NaN (one instruction on every target)."""
+
+
 @intrinsic
 def multiply_add(typing_context: Any, a: Any, b: Any, c: Any) -> Any:
     """Return a * b + c, in one rounding where the hardware can."""
@@ -324,16 +352,6 @@ def multiply_add(typing_context: Any, a: Any, b: Any, c: Any) -> Any:
         return _call(builder, "fmuladd", a, args)
 
     return a(a, b, c), emit
-
-
-@intrinsic
-def square_root(typing_context: Any, a: Any) -> Any:
-    """Correctly rounded square root."""
-
-    def emit(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        return _call(builder, "sqrt", a, args)
-
-    return a(a), emit
 
 
 # Hardware estimates by feature of the target and float32 lanes: LLVM's name, arguments after `a`.
@@ -403,16 +421,6 @@ def reciprocal(typing_context: Any, a: Any) -> Any:
 
 
 @intrinsic
-def rounded(typing_context: Any, a: Any) -> Any:
-    """The nearest whole number, halves to even."""
-
-    def emit(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        return _call(builder, "rint", a, args)
-
-    return a(a), emit
-
-
-@intrinsic
 def sum_of(typing_context: Any, a: Any) -> Any:
     """The sum of all lanes, in any order."""
 
@@ -424,36 +432,6 @@ def sum_of(typing_context: Any, a: Any) -> Any:
         return builder.call(function, [ir.Constant(scalar, -0.0), args[0]], fastmath=("reassoc",))
 
     return a.scalar(a), emit
-
-
-@intrinsic
-def absolute(typing_context: Any, a: Any) -> Any:
-    """|a|."""
-
-    def emit(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        return _call(builder, "fabs", a, args)
-
-    return a(a), emit
-
-
-@intrinsic
-def maximum(typing_context: Any, a: Any, b: Any) -> Any:
-    """The larger of a and b; b where either is NaN (one instruction on every target)."""
-
-    def emit(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        return builder.select(builder.fcmp_ordered(">", args[0], args[1]), args[0], args[1])
-
-    return a(a, b), emit
-
-
-@intrinsic
-def minimum(typing_context: Any, a: Any, b: Any) -> Any:
-    """The smaller of a and b; b where either is NaN."""
-
-    def emit(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        return builder.select(builder.fcmp_ordered("<", args[0], args[1]), args[0], args[1])
-
-    return a(a, b), emit
 
 
 @intrinsic
