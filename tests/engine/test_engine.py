@@ -11,7 +11,7 @@ from uuid import uuid4
 import numpy as np
 import pytest
 from rich.console import Console
-from tests.engine.bench import CALIBRATION, SETTINGS, Bench, make, simulated
+from tests.engine.bench import SETTINGS, Bench, make, simulated
 from tests.patience import LIMIT_S
 
 import faintspot as fs
@@ -23,7 +23,6 @@ from faintspot.engine.streams.bridge import StreamBridge
 from faintspot.engine.workers import PipelineMaker
 from faintspot.io import open_frames
 from faintspot.slopes.pipeline import configuration
-from faintspot.slopes.pipeline.configuration import unpacked
 
 pyshmem = pytest.importorskip("pyshmem")
 
@@ -57,10 +56,6 @@ def test_what_is_published(bench: Bench) -> None:
     assert 0 < published_ns - last_row_ns < 60e9
     for stream in streams.values():
         stream.close()
-
-
-def test_telemetry_says_with_which_calibration_and_spot(bench: Bench) -> None:
-    assert unpacked(bench.telemetry.description["parts"]) == (CALIBRATION, None, None)
 
 
 def test_restarted_source_loses_no_frame(bench: Bench) -> None:

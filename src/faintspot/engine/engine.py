@@ -24,7 +24,7 @@ from faintspot.engine.timing import INCOMPLETE, WORKER, FrameAccount
 from faintspot.engine.workers import SlopePrior, Workers
 from faintspot.loop.control.configuration import Control, packed_control
 from faintspot.loop.control.options import NONE, STREAM
-from faintspot.slopes.pipeline.configuration import packed, to_text
+from faintspot.slopes.pipeline.configuration import to_text
 from faintspot.slopes.pipeline.settings import Settings
 from faintspot.slopes.pipeline.slope_pipeline import SlopePipeline
 
@@ -128,7 +128,6 @@ class Engine:
 
                     self._prediction = PredictionStream(name, prior)
             self._make_ready(interleaving)
-            first = self.live.running.pipelines[0]
             self._telemetry = TelemetryRing.create(
                 name,
                 layout,
@@ -136,7 +135,6 @@ class Engine:
                 methods=interleaving.labels,
                 commands=commands,
                 reference=None if control is None else control.reference,
-                parts=packed(first.calibration, *first.spot),
                 control=packed_control(control),
             )
             self._resources.callback(self._telemetry.close)

@@ -16,17 +16,10 @@ from numpy.typing import NDArray
 from faintspot.base.checks import finite_array
 from faintspot.base.errors import InputError, MissingExtraError
 from faintspot.base.files import check_bytes, memory_bytes
-from faintspot.base.text_files import parse_json
 from faintspot.io.fits_units import AOT_VERSION, is_aot, units_of
 from faintspot.io.stored_array import one_line
 
 _PIXELS = ("pix", "pixel", "px")
-
-
-NOISE = "SLOPES_NOISE"
-"""Name of the table with the noise and the flags of slopes, in files written by faintspot."""
-NOISE_COLUMNS = "VAR_X", "VAR_Y", "COV_XY"
-FLAGS_COLUMN = "FLAGS"
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -47,10 +40,6 @@ class AotSensor:
     """Number of sub-apertures."""
     layout: Mapping[str, Any] | None
     """Arguments of `faintspot.Layout`."""
-    tables: Mapping[str, Any]
-    """Tables [estimator] and [settings] of a faintspot.toml, in files written by faintspot."""
-    parts: Mapping[str, str] | None
-    """Calibration, PSF and score in such files, for `faintspot.slopes.pipeline.configuration.unpacked`."""
     reference: NDArray[np.float64] | None
     """Slopes that are to be or were subtracted, (2 n,): px from the layout's centres, all x, then all y."""
     pixels: str | None
@@ -60,10 +49,6 @@ class AotSensor:
     slopes: NDArray[Any] | None
     """Slopes as stored, (t, 2, n): x and y, in `unit`."""
     unit: str
-    noise: NDArray[Any] | None
-    """Variances of x and y and their covariance, px^2, (t, 3, n), in files written by faintspot."""
-    flags: NDArray[np.uint8] | None
-    """Bits of `faintspot.SubapertureFlag`, (t, n), in files written by faintspot."""
     frame: NDArray[np.float64]
     """Frame numbers of the slopes; empty if the file has none."""
     unix_time_s: NDArray[np.float64]
@@ -136,7 +121,6 @@ def read_aot(path: str | Path, sensor: str | None = None) -> AotSensor:
         try:
             # By default aotpy would ask for external images in a dialogue, or fetch them.
             system = AOTFITSReader(path, externals="ignore").get_system()
-            noise, flags = _noise_and_flags(path)
         except Exception as error:  # aotpy raises many kinds of errors on damaged files
             raise InputError(f"{path}: the AOT file is not valid ({one_line(error)})") from None
     sensors = [item for item in system.wavefront_sensors if isinstance(item, aotpy.ShackHartmann)]
@@ -145,7 +129,7 @@ def read_aot(path: str | Path, sensor: str | None = None) -> AotSensor:
         loop for loop in system.loops if isinstance(loop, aotpy.ControlLoop) and loop.input_sensor is chosen
     ]
     try:
-        return _sensor(path, chosen, system, loops, noise, flags)
+        return _sensor(path, chosen, system, loops)
     except InputError as error:
         raise InputError(f"{path}: sensor {chosen.uid!r}: {error}") from None
     except (ValueError, TypeError, KeyError, IndexError, AttributeError) as error:
@@ -172,7 +156,7 @@ def _pixels_of(sensor: Any) -> str | None:
     return None if image is None or image.data is None else str(image.name)
 
 
-def _sensor(path: Path, sensor: Any, system: Any, loops: list[Any], noise: Any, flags: Any) -> AotSensor:
+def _sensor(path: Path, sensor: Any, system: Any, loops: list[Any]) -> AotSensor:
     n = int(sensor.n_valid_subapertures)
     name, size = _pixels_of(sensor), None
     pixels = None if name is None else sensor.detector.pixel_intensities
@@ -181,33 +165,19 @@ def _sensor(path: Path, sensor: Any, system: Any, loops: list[Any], noise: Any, 
             shape = pixels.data.shape
             raise InputError(f"pixel_intensities: expected (frames, height, width), got shape {shape}")
         size = int(pixels.data.shape[-2]), int(pixels.data.shape[-1])
-    details = _details(sensor.ref_measurements)
-    layout = details["LAYOUT"] if "LAYOUT" in details else _layout(sensor, n, size)
-    if "SUBTRACT" in details:
-        reference = None if details["SUBTRACT"] is None else np.asarray(details["SUBTRACT"], np.float64)
-    else:
-        reference = _reference(sensor, n)
     slopes, flux = _data_of(sensor, "measurements", "t", 2, n), _data_of(sensor, "subaperture_intensities")
-    if noise is not None and (slopes is None or noise.shape != (len(slopes), 3, n)):
-        raise InputError(f"{NOISE}: expected as many variances and covariances as slopes, got {noise.shape}")
-    if flags is not None and (slopes is None or flags.shape != (len(slopes), n)):
-        raise InputError(f"{NOISE}: expected as many flags as slopes, got {flags.shape}")
     numbers, times = _time_of(sensor.measurements)
     scale = _number(sensor.detector, "pixel_scale")
     return AotSensor(
         path,
         str(sensor.uid),
         n,
-        layout,
-        _tables(system),
-        details.get("PARTS"),
-        reference,
+        _layout(sensor, n, size),
+        _reference(sensor, n),
         name,
         _time_of(pixels)[0],
         slopes,
         "" if slopes is None else str(sensor.measurements.unit or ""),
-        noise,
-        flags,
         numbers,
         times,
         flux,
@@ -301,37 +271,9 @@ def _data_of(owner: object, name: str, *shape: int | str) -> Any:
     return data.astype(data.dtype.newbyteorder("="), copy=False)
 
 
-def _noise_and_flags(path: Path) -> tuple[NDArray[np.float32] | None, NDArray[np.uint8] | None]:
-    """Return noise (t, 3, n) and flags (t, n) of the slopes in files written by faintspot, or None."""
-    from astropy.io import fits
-
-    with fits.open(path) as units:
-        if NOISE not in units:
-            return None, None
-        table = units[NOISE].data
-        noise = np.stack([np.asarray(table[name], np.float32) for name in NOISE_COLUMNS], axis=1)
-        return noise, np.asarray(table[FLAGS_COLUMN], np.uint8)
-
-
 def _time_of(image: Any) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return frame numbers and times of an image; empty if it has none."""
     time = None if image is None else image.time
     values = ([], []) if time is None else (time.frame_numbers, time.timestamps)
     numbers, stamps = (np.asarray([] if data is None else data, np.float64) for data in values)
     return numbers, stamps
-
-
-def _details(image: Any) -> dict[str, Any]:
-    """Return the data that faintspot has written with the references."""
-    if image is None:
-        return {}
-    values = {item.key: item.value for item in image.metadata}
-    return {name: parse_json(values[name]) for name in ("LAYOUT", "SUBTRACT", "PARTS") if name in values}
-
-
-def _tables(system: Any) -> dict[str, Any]:
-    """Return estimator and settings of a file written by faintspot."""
-    if not any(item.key == "ORIGIN" and item.value == "faintspot" for item in system.metadata):
-        return {}
-    tables = parse_json(system.config)
-    return tables if isinstance(tables.get("settings", {}), dict) else {}

@@ -1,11 +1,12 @@
 """Writing telemetry as a file of the Adaptive Optics Telemetry standard (AOT, FITS), with aotpy.
 
 Dimensions and units follow the documentation of aotpy 3 (https://pypi.org/project/aotpy/). AOT has fields for
-slopes, fluxes, frames and times. It has none for the noise of slopes, which has a table of its own, and none
-for flags, iterations, the interleaved configurations and denoised images: these stay in the Zarr store.
+slopes, fluxes, frames and times. It has none for the noise of slopes, flags, iterations, the interleaved
+configurations and denoised images: these stay in the Zarr store.
 """
 
 import warnings
+from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -17,7 +18,6 @@ from faintspot.base.checks import one_of
 from faintspot.base.errors import InputError, MissingExtraError
 from faintspot.base.files import write_atomically
 from faintspot.base.text_files import parse_text, to_json
-from faintspot.io.aot_reading import FLAGS_COLUMN, NOISE, NOISE_COLUMNS
 from faintspot.io.telemetry import Telemetry
 
 # The standard demands both, which a sensor alone does not have.
@@ -29,14 +29,11 @@ def write_aot(path: str | Path, telemetry: Telemetry, *, ao_mode: str = "SCAO") 
     """Write telemetry to an AOT file.
 
     AOT demands a telescope, a source and a mode; the first two are written as names without data. Slopes are
-    `measurements` (t, 2, n), px, x and y. They were published with the reference subtracted, which is stored
-    as `ref_measurements`, px from the centre of each window. Fluxes are sums over the sub-aperture in
-    electrons after background subtraction; the standard has averages in ADU. The keyword CONFIG holds the
-    initial estimator and settings; CHG1, CHG2 and so on hold changes. LAYOUT and SUBTRACT of the references
-    hold the layout and the exact reference slopes as JSON texts. The table SLOPES_NOISE, which is not part
-    of the standard, holds VAR_X, VAR_Y (infinite where unknown) and COV_XY of the slopes, px^2, and their
-    FLAGS, a row for each frame. There are no wavefront correctors and loops, so that aotpy warns when it
-    reads the file. All data are in memory at once.
+    `measurements` (t, 2, n), px, x and y, NaN where not valid. They were published with the reference
+    subtracted, which is stored as `ref_measurements`, px from the centre of each window. Fluxes are sums over
+    the sub-aperture in electrons after background subtraction; the standard has averages in ADU. The keyword
+    CONFIG holds the initial estimator and settings; CHG1, CHG2 and so on hold changes. There are no wavefront
+    correctors and loops, so that aotpy warns when it reads the file. All data are in memory at once.
 
     Parameters
     ----------
@@ -72,7 +69,6 @@ def write_aot(path: str | Path, telemetry: Telemetry, *, ao_mode: str = "SCAO") 
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", _EXPECTED)
         file = AOTFITSWriter(_system(telemetry, ao_mode)).get_hdulist()
-    file.append(_noise(telemetry))
     write_atomically(target, file.writeto)
 
 
@@ -95,19 +91,6 @@ def _system(telemetry: Telemetry, ao_mode: str) -> Any:
         wavefront_sensors=[_sensor(telemetry, source, tables.get("estimator", {}).get("name"))],
         metadata=_metadata(telemetry),
     )
-
-
-def _noise(telemetry: Telemetry) -> object:
-    """Return the table with variances and covariance of every slope's errors, and its flags."""
-    from astropy.io import fits
-
-    errors = telemetry.standard_error_x, telemetry.standard_error_y
-    columns = [
-        fits.Column(name, f"{values.shape[1]}E", "pix2", array=values)
-        for name, values in zip(NOISE_COLUMNS, (*np.square(errors), telemetry.covariance_xy), strict=True)
-    ]
-    columns.append(fits.Column(FLAGS_COLUMN, f"{telemetry.flags.shape[1]}B", array=telemetry.flags))
-    return fits.BinTableHDU.from_columns(columns, name=NOISE)
 
 
 def _metadata(telemetry: Telemetry) -> list[Any]:
@@ -133,7 +116,8 @@ def _sensor(telemetry: Telemetry, source: object, estimator: str | None) -> obje
     when = aotpy.Time(
         "FRAMES", timestamps=telemetry.unix_time_s.tolist(), frame_numbers=telemetry.frame.tolist()
     )
-    slopes = np.stack([telemetry.x, telemetry.y], axis=1)
+    valid = telemetry.valid[:, None]
+    slopes = np.where(valid, np.stack([telemetry.x, telemetry.y], axis=1), np.float32(np.nan))
     subtracted = aotpy.Metadatum("REFSUB", True, "reference has been subtracted already")
     summed = aotpy.Metadatum("FLUXSUM", True, "sum over the sub-aperture after background")
     middle = corners[:, ::-1] + 0.5 * (np.array(window[::-1]) - 1)
@@ -141,20 +125,14 @@ def _sensor(telemetry: Telemetry, source: object, estimator: str | None) -> obje
     reference = (np.array(layout["centres"]) - middle).T
     if taken_off is not None:
         reference = reference + np.reshape(taken_off, reference.shape)
-    exact = [
-        aotpy.Metadatum("LAYOUT", to_json(layout), "as faintspot has it"),
-        aotpy.Metadatum("PARTS", to_json(attributes.get("parts")), "calibration, PSF, score"),
-        aotpy.Metadatum("SUBTRACT", to_json(taken_off), "slopes that were subtracted, px"),
-    ]
     sensor = aotpy.ShackHartmann(
         uid="SENSOR",
         source=source,
         n_valid_subapertures=len(corners),
         measurements=aotpy.Image("SLOPES", slopes, "pix", when, [subtracted]),
-        ref_measurements=aotpy.Image("REFERENCE", reference.astype(np.float32), "pix", metadata=exact),
+        ref_measurements=aotpy.Image("REFERENCE", reference, "pix"),
         subaperture_intensities=aotpy.Image("FLUX", telemetry.flux, "electron", when, [summed]),
-        # AOT supports square sub-apertures only.
-        subaperture_size=float(window[0]) if window[0] == window[1] else None,
+        subaperture_size=_size(window, corners, np.array(layout["cells"])),
         mask_offsets=[aotpy.Coordinates(float(corners[:, 1].min()), float(corners[:, 0].min()))],
         centroiding_algorithm=estimator,
         detector=_detector(telemetry),
@@ -163,6 +141,12 @@ def _sensor(telemetry: Telemetry, source: object, estimator: str | None) -> obje
     if mask is not None:
         sensor.subaperture_mask = aotpy.Image("SUBAPERTURES", mask)
     return sensor
+
+
+def _size(window: Sequence[int], corners: NDArray[np.int64], cells: NDArray[np.int64]) -> float | None:
+    """Return the side of square windows without gaps; the standard describes no others: None."""
+    expected = corners.min(axis=0) + window[0] * (cells - cells.min(axis=0))
+    return float(window[0]) if window[0] == window[1] and np.array_equal(corners, expected) else None
 
 
 def _mask(cells: NDArray[np.int64]) -> NDArray[np.int32] | None:

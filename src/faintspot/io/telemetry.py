@@ -25,8 +25,8 @@ from faintspot.io.zarr_store import (
 zarr = load_package("zarr")
 FRAMES, IMAGES = "finished_frames", "finished_images"
 """Attributes of a store: numbers of complete frames and images."""
-PARTS, CONTROL = "parts", "control"
-"""Large attributes, in a group of their own: the others are replaced with every block of frames."""
+CONTROL = "control"
+"""A large attribute, in a group of its own: the others are replaced with every block of frames."""
 _NOT_STORED = "sequence"  # used by the rings only
 
 
@@ -248,9 +248,8 @@ class StoredTelemetry:
         try:
             attributes = stored_attributes(store)
             is_telemetry = attributes["format"] == TELEMETRY and attributes["version"] == 1
-            if (store / PARTS).is_dir():
-                stored = stored_attributes(store / PARTS)
-                attributes |= {PARTS: stored[PARTS], CONTROL: stored.get(CONTROL)}
+            if (store / CONTROL).is_dir():
+                attributes |= stored_attributes(store / CONTROL)
         except (OSError, ValueError, KeyError, TypeError):
             is_telemetry = False
         if not (is_telemetry and is_store(store)):

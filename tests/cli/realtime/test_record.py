@@ -23,7 +23,6 @@ pytestmark = [
     pytest.mark.skipif(not FOLDER.is_dir(), reason="needs POSIX shared memory as Linux has it"),
     # A sensor alone has neither, of which the reader of AOT files complains.
     pytest.mark.filterwarnings("ignore:.AOT_(WAVEFRONT_CORRECTORS|LOOPS). .* contains no data"),
-    pytest.mark.filterwarnings("ignore:.*'SLOPES_NOISE' is not an AOT binary table"),
 ]
 
 

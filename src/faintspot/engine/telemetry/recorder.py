@@ -20,12 +20,11 @@ from faintspot.base.files import output_errors
 from faintspot.engine.interleaving import methods_after
 from faintspot.engine.readout import StopEvent
 from faintspot.engine.telemetry.ring import Ring, TelemetryRing
-from faintspot.io.telemetry import ARRAYS, CONTROL, FRAMES, IMAGES, PARTS, stored_names
+from faintspot.io.telemetry import ARRAYS, CONTROL, FRAMES, IMAGES, stored_names
 from faintspot.io.zarr_store import TELEMETRY, checked_codecs, new_store, replace_attributes
 
 zarr = load_package("zarr")
 _CHUNK_NUMBERS, _CHUNK_BYTES = 1 << 16, 1 << 22
-_WRITTEN_ONCE = PARTS, CONTROL
 
 
 class TelemetryStore:
@@ -89,9 +88,9 @@ class TelemetryStore:
 
 
 def _create(path: Path, kinds: tuple[np.dtype[np.void], ...], attributes: Mapping[str, object]) -> None:
-    rest = {name: value for name, value in attributes.items() if name not in _WRITTEN_ONCE}
+    rest = {name: value for name, value in attributes.items() if name != CONTROL}
     with new_store(path, rest) as group:
-        group.create_group(PARTS, attributes={name: attributes.get(name) for name in _WRITTEN_ONCE})
+        group.create_group(CONTROL, attributes={CONTROL: attributes.get(CONTROL)})
         for name, values in (column for kind in kinds for column in _columns(np.empty(0, kind))):
             row = values.shape[1:]
             size = int(np.prod(row))
@@ -195,7 +194,7 @@ class Recorder:
             0  # from the first one, to know the settings at the start
         )
         self._changes: list[dict[str, object]] = []
-        described = ("layout", "settings", "reference", "parts", "control")
+        described = ("layout", "settings", "reference", "control")
         attributes = {
             "name": name,
             **{key: reader.description[key] for key in described},

@@ -126,8 +126,6 @@ class Described(TypedDict, total=False):
     """Names of the interleaved configurations."""
     reference: ArrayLike | None
     """Reference slopes that were subtracted, (2 n,) [px]."""
-    parts: Mapping[str, str] | None
-    """Calibration, PSF and score (`faintspot.slopes.pipeline.configuration.packed`)."""
     control: Mapping[str, object] | None
     """Interaction matrix and options (`faintspot.loop.control.configuration.packed_control`)."""
 
@@ -224,7 +222,6 @@ class TelemetryRing(Segment):
         reference = described.get("reference")
         description = {
             "settings": "",
-            "parts": None,
             "control": None,
             **described,
             "layout": layout_values(layout),

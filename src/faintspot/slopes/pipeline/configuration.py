@@ -5,11 +5,9 @@ Calibration maps, PSF and score are stored beside it, in NAME.calibration.npz et
 
 from __future__ import annotations
 
-import base64
 from collections.abc import Mapping
 from functools import cached_property
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
 from faintspot.base.errors import InputError, errors_within
@@ -26,7 +24,6 @@ from faintspot.slopes.spots.psf import PSF
 if TYPE_CHECKING:
     from faintspot.slopes.spots.laser_spots import LaserSpots
 
-_PACKED, _MOST_PACKED_BYTES = "faintspot.toml", 1 << 20
 _FILTER = "laser.matched_filter"
 _ANALYTIC_KEYS = ("profile", "size", "elongation", "angle_deg", "radius_px")
 
@@ -164,37 +161,6 @@ def save(path: str | Path, item: Item) -> None:
     store = derived(path, f".{table}.npz")
     item.save(store)
     save_tables(path, {table: {"file": store.name}})
-
-
-def packed(calibration: Calibration, psf: PSF | None, score: FixedWeights | None) -> dict[str, str] | None:
-    """Return the files that `save` writes, as base64 text by name; None if they exceed 1 MiB in total."""
-    with TemporaryDirectory() as folder:
-        for item in (calibration, psf, score):
-            if item is not None:
-                save(Path(folder) / _PACKED, item)
-        files = list(Path(folder).iterdir())
-        if sum(file.stat().st_size for file in files) > _MOST_PACKED_BYTES:
-            return None
-        return {file.name: base64.b64encode(file.read_bytes()).decode() for file in files}
-
-
-def unpacked(files: Mapping[str, str]) -> tuple[Calibration, PSF | None, FixedWeights | None]:
-    """Return the inputs of `packed` from its result.
-
-    Raises
-    ------
-    InputError
-        If the files are invalid.
-    """
-    with TemporaryDirectory() as folder:
-        path = Path(folder) / _PACKED
-        try:
-            for name, text in files.items():
-                (Path(folder) / Path(name).name).write_bytes(base64.b64decode(text, validate=True))
-        except (OSError, ValueError, TypeError, AttributeError):
-            raise InputError("configuration: expected files in base64") from None
-        stored = Configuration(path)
-        return stored.calibration, stored.psf, stored.score
 
 
 def to_text(*items: Layout | Calibration | Settings) -> str:

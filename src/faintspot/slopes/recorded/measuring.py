@@ -137,8 +137,7 @@ def measure_recorded(
         FITS, TIFF, .npy, .npz or Zarr; see `faintspot.io.open_frames`.
     configuration_file : path
         The TOML file with layout, settings and calibration. Where it has no layout, sub-apertures and
-        reference slopes are those of the first file of frames, if that is an AOT file, and where there is no
-        such file, the settings, too.
+        reference slopes are those of the first file of frames, if that is an AOT file.
     output : path
         .zarr, .fits, .npz or .csv.
     threads : int, optional
@@ -381,8 +380,6 @@ def _attributes(
 def _files_of_the_spot(described: Configuration) -> dict[str, str]:
     """Return the files of PSF and score, for a report: their own, or the configuration."""
     path = described.path.resolve()
-    if not path.exists():  # everything was in a file of telemetry
-        return {}
     return {
         f"{part}_file": str(path.parent / described[part].get("file", path.name))
         for part in ("psf", "score")

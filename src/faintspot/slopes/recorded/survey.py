@@ -16,7 +16,6 @@ from faintspot.io.fits_units import is_aot
 from faintspot.io.frames import FrameSource
 from faintspot.io.stored_array import split_location
 from faintspot.slopes.camera.frame_checks import LargestValues, MeanFrame, are_repeated
-from faintspot.slopes.pipeline import configuration
 from faintspot.slopes.pipeline.configuration import Configuration
 from faintspot.slopes.pipeline.slope_pipeline import SlopePipeline
 from faintspot.slopes.sensor.layout import Layout
@@ -144,18 +143,11 @@ def configured(
         )
     with errors_within(where):
         layout = Layout(**sensor.layout)
-    words = ["sub-apertures", *(["reference slopes"] if sensor.reference is not None else [])]
-    parts: dict[str, Any] = {"layout": layout}
     if described is None:
-        if not sensor.tables:
-            command = _layout_command(frames[0], layout, path)
-            raise InputError(f"{path}: no such file, and {first[0]} has no settings; `{command}` makes one")
-        words.append("settings")
-        if sensor.parts is not None:
-            stored = configuration.unpacked(sensor.parts)
-            parts |= dict(zip(("calibration", "psf", "score"), stored, strict=True))
-    tables = sensor.tables if described is None else described.tables
-    return Configuration(path, tables, **parts), f"{', '.join(words)} of {first[0]}", sensor.reference
+        command = _layout_command(frames[0], layout, path)
+        raise InputError(f"{path}: no such file; `{command}` makes one with settings for {first[0]}")
+    words = "sub-apertures" if sensor.reference is None else "sub-apertures, reference slopes"
+    return Configuration(path, described.tables, layout=layout), f"{words} of {first[0]}", sensor.reference
 
 
 def _aot_file(frames: Sequence[str | Path]) -> tuple[Path, str | None] | None:
