@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 import faintspot as fs
 from benchmarks.foreign.base import IMAGING_M, Floats, SteppedLoop
-from faintspot.adapters.oopao import Spots
+from faintspot.adapters.base import ToolSlopes
 from faintspot.loop.slope_covariance import ARCSEC
 
 _READ_NOISE_E = 1.0
@@ -63,7 +63,8 @@ class SoapyLoop(SteppedLoop):
         camera = fs.Calibration(dark=0.0, read_noise_e=_READ_NOISE_E)
         spot_px = _SENSING_M / _LENSLET_M / (_FIELD_ARCSEC / _SUBAPERTURE_PX * ARCSEC)
         count, psf = int(self._sensor.n_subaps), fs.PSF.analytic(size=spot_px / 2)
-        _measure_with(self._sensor, Spots("soapy", count, _SUBAPERTURE_PX, settings, camera, psf=psf))
+        layout = fs.Layout.stacked(count, (_SUBAPERTURE_PX, _SUBAPERTURE_PX))
+        _measure_with(self._sensor, ToolSlopes(layout, settings, camera, psf=psf))
         with contextlib.redirect_stdout(io.StringIO()):
             self._system.makeIMat(forceNew=True)
         self.unit_arcsec = self._tilt_arcsec()
@@ -126,8 +127,8 @@ class SoapyLoop(SteppedLoop):
         return slopes, float(abs(np.exp(1j * sight.phase[self._pupil]).mean()) ** 2)
 
 
-def _measure_with(sensor: Any, spots: Spots) -> None:
-    """Make positions of spots the centroider of a sensor, which soapy looks up by name in its module."""
+def _measure_with(sensor: Any, tool: ToolSlopes) -> None:
+    """Make slopes of a tool the centroider of a sensor, which soapy looks up by name in its module."""
 
     def centroid(images: Any, threshold: Any = None, ref: Any = None, **_: Any) -> Floats:
         """Return positions as soapy's centroiders do: (2, n) px from the first pixel."""
@@ -135,7 +136,8 @@ def _measure_with(sensor: Any, spots: Spots) -> None:
         noise_free = bool(sensor.iMat) or not (config.photonNoise or config.eReadNoise)
         # soapy subtracts half a window, so that a centred spot has -1/2, part of the static slopes.
         reference = np.full((2, len(images)), 0.5) + (0.0 if static is None else static)
-        found = spots.places(spots.checked(images), reference, noise_free=noise_free)
+        found = tool.measure(np.reshape(images, (-1, _SUBAPERTURE_PX)), noise_free=noise_free)
+        found = np.where(tool.last.measured, found, reference)
         return np.asarray(found + 0.5 * (_SUBAPERTURE_PX - 1))
 
     sys.modules[type(sensor).__module__].centroiders.faintspot = centroid

@@ -28,11 +28,6 @@ REFERENCE = np.random.default_rng(1).uniform(-0.3, 0.3, 2 * N)
 LAYOUT = fs.Layout(**ATTRIBUTES["layout"])
 
 
-@pytest.fixture
-def run(capsys: pytest.CaptureFixture[str]) -> Commands:
-    return Commands(capsys)
-
-
 def own(folder: Path, images: NDArray[Any] | None = None, **attributes: Any) -> Path:
     """Return an AOT file of ours."""
     shutil.rmtree(folder / "night.zarr", ignore_errors=True)

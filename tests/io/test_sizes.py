@@ -122,12 +122,12 @@ def test_zarr_chunks_that_inflate_to_more(tmp_path: Path, codec: str, zarr_forma
     if zarr_format == 3 and codec in ("zlib", "lz4", "bz2", "lzma"):
         pytest.skip("formats of other codecs are not fixed")
     numcodec = numcodecs.get_codec({"id": codec}) if codec else None
-    of_format_3 = {
+    codecs = {
         "gzip": zarr.codecs.GzipCodec,
         "zstd": zarr.codecs.ZstdCodec,
         "blosc": zarr.codecs.BloscCodec,
     }
-    compressor = numcodec if zarr_format == 2 else of_format_3[codec]() if codec else None
+    compressor = numcodec if zarr_format == 2 else codecs[codec]() if codec else None
     values = np.ones((2, 1000, 1000), np.uint16)
     path = tmp_path / "a.zarr"
     zarr.create_array(

@@ -11,8 +11,10 @@ from tests.io.telemetry_files import (
     ATTRIBUTES,
     CHANGES,
     IMAGE,
+    LATER,
     RECORD,
     SHAPE,
+    SIZES,
     START_NS,
     N,
     images_of,
@@ -22,7 +24,7 @@ from tests.refusals import refused
 
 from faintspot.engine.telemetry.recorder import TelemetryStore
 from faintspot.io import Telemetry, read_telemetry, write_aot
-from faintspot.io.telemetry import LARGEST_GAP, all_left_out, left_out
+from faintspot.io.telemetry import LARGEST_GAP, all_left_out, item_type, left_out
 from faintspot.slopes.sensor.layout import Layout
 
 pytest.importorskip("zarr")
@@ -71,7 +73,7 @@ def test_what_was_appended_is_read(store: TelemetryStore) -> None:
 def test_commands_are_read_and_stores_of_engines_without_a_loop_have_none(store: TelemetryStore) -> None:
     telemetry = read_telemetry(store.path)
     assert (telemetry.loop.tolist(), telemetry.commands.shape) == ([0] * 15, (15, 0))
-    kind = np.dtype([*RECORD.descr, ("loop", np.int64), ("commands", np.float32, (5,))])
+    kind = item_type("frame", {**SIZES, "command": 5}, LATER[:3])
     records = np.zeros(4, kind)
     records["frame"], records["loop"] = np.arange(4), [1, 1, 2, 2]
     records["commands"] = np.arange(20).reshape(4, 5)

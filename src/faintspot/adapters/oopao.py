@@ -15,103 +15,6 @@ from faintspot.slopes.camera.calibration import Calibration
 from faintspot.slopes.pipeline.settings import Settings
 from faintspot.slopes.sensor.layout import Layout
 
-
-class SpotOptions(AdapterOptions, total=False):
-    """Options of adapters for tools that cut out the windows themselves."""
-
-    predict: Any
-
-
-class Spots:
-    """Spot positions in a tool's windows, with the tool's references and predictions.
-
-    Parameters
-    ----------
-    tool : str
-        Name of the tool, for errors.
-    n, side : int
-        Number of windows, and their side in pixels.
-    settings, calibration
-        See `ToolSlopes`.
-    predict : callable or object with `predict`, optional
-        See `faintspot.adapters.base.predicted`: slopes in the tool's order and unit.
-    rows_first : bool
-        Whether the tool puts coordinates along rows (y) before those along columns (x).
-    **options
-        See `ToolSlopes`.
-    """
-
-    def __init__(
-        self,
-        tool: str,
-        n: int,
-        side: int,
-        settings: Settings,
-        calibration: Calibration | None,
-        *,
-        predict: object = None,
-        rows_first: bool = False,
-        **options: Unpack[AdapterOptions],
-    ) -> None:
-        self._tool, self._shape, self._predict = tool, (n, side, side), predict
-        self._order = slice(None, None, -1 if rows_first else 1)
-        layout = Layout.stacked(n, (side, side))
-        self.measured = ToolSlopes(layout, settings, calibration, **options)
-        self._slopes: NDArray[np.float64] | None = None
-
-    def checked(self, images: object) -> NDArray[Any]:
-        """Return a tool's images after checking their number and size.
-
-        Raises
-        ------
-        InputError
-            When there is another number of images, or another size.
-        """
-        array = np.asarray(images)
-        if array.shape != self._shape:
-            raise InputError(
-                f"{self._tool}'s images: expected shape {self._shape}, got {array.shape}; attach faintspot "
-                "again after changing the sensor"
-            )
-        return array
-
-    def places(
-        self, images: NDArray[Any], reference: NDArray[np.float64], unit: float = 1.0, *, noise_free: bool
-    ) -> NDArray[np.float64]:
-        """Return the spot positions in pixels from the windows' centres, in the tool's order: (2, n).
-
-        Parameters
-        ----------
-        images : (n, side, side) array
-            Images returned by `checked`.
-        reference : (2, n) array
-            The tool's reference positions, in the same coordinates. Invalid spots get them, too.
-        unit : float
-            Pixels per unit of the tool's slopes.
-        noise_free : bool
-            Whether the tool declares these images as noise-free calibration images.
-
-        Raises
-        ------
-        InputError
-            As for `ToolSlopes.measure`.
-        """
-        n, side = self._shape[:2]
-        noise_free = noise_free or self.measured.noise_free
-        prior = None
-        if not noise_free:
-            slopes = predicted(self._predict, self._slopes, (2 * n,))
-            if slopes is not None:
-                prior = (slopes.reshape(2, n) * unit + reference)[self._order].ravel()
-        found = self.measured.measure(images.reshape(-1, side), prior_px=prior, noise_free=noise_free)[
-            self._order
-        ]
-        found = np.where(self.measured.last.measured, found, reference)
-        if not noise_free:
-            self._slopes = ((found - reference) / unit).ravel()
-        return found
-
-
 TESTED = "1.0.0"
 _LEAST_UNIT = 1e-6  # smallest unit of OOPAO's slopes; a tilt of one pixel gives about 1
 
@@ -120,7 +23,9 @@ def attach(
     wfs: object,
     settings: Settings,
     calibration: Calibration | None = None,
-    **options: Unpack[SpotOptions],
+    *,
+    predict: Any = None,
+    **options: Unpack[AdapterOptions],
 ) -> OOPAOAttachment:
     """Make an OOPAO `ShackHartmann` measure its slopes with faintspot, and recalibrate it.
 
@@ -151,14 +56,19 @@ def attach(
     InputError
         When the sensor is of another kind, geometric or has a weighting map, or as for `ToolSlopes`.
     """
-    return OOPAOAttachment(wfs, settings, calibration, options)
+    return OOPAOAttachment(wfs, settings, calibration, predict, options)
 
 
 class OOPAOAttachment:
     """faintspot in an OOPAO sensor; see `attach`."""
 
     def __init__(
-        self, wfs: Any, settings: Settings, calibration: Calibration | None, options: SpotOptions
+        self,
+        wfs: Any,
+        settings: Settings,
+        calibration: Calibration | None,
+        predict: Any,
+        options: AdapterOptions,
     ) -> None:
         if getattr(wfs, "tag", None) != "shackHartmann":
             raise InputError(f"wfs: expected OOPAO's ShackHartmann, got {type(wfs).__name__}")
@@ -171,12 +81,12 @@ class OOPAOAttachment:
             raise InputError(
                 'wfs: expected no weighting map, got one; leave it out and use the estimator "window"'
             )
-        predict, several = options.get("predict"), len(sources) > 1
-        predicts = list(predict) if several and predict is not None else [predict] * len(sources)
+        several = len(sources) > 1 and predict is not None
+        predicts = list(predict) if several else [predict] * len(sources)
         if len(predicts) != len(sources):
             raise InputError(f"predict: expected one for each of {len(sources)} sources, got {len(predicts)}")
         self._sources = [
-            _Source(wfs, source, settings, calibration, {**options, "predict": each})
+            _Source(wfs, source, each, ToolSlopes(_windows(wfs, source), settings, calibration, **options))
             for source, each in zip(sources, predicts, strict=True)
         ]
         self._current = self._sources[0]
@@ -232,28 +142,40 @@ class OOPAOAttachment:
         return self._current.positions(image)
 
 
+def _windows(wfs: Any, source: Any) -> Layout:
+    """Return the windows of a source, one below the other."""
+    return Layout.stacked(int(source.nValidSubaperture), (int(wfs.n_pix_subap),) * 2)
+
+
 class _Source:
-    """Sub-apertures of one source."""
+    """Sub-apertures of one source. Coordinates along rows (y) come before those along columns (x)."""
 
-    def __init__(
-        self, wfs: Any, data: Any, settings: Settings, calibration: Calibration | None, options: SpotOptions
-    ) -> None:
-        self.wfs, self.data = wfs, data
-        self._n, side = int(data.nValidSubaperture), int(wfs.n_pix_subap)
-        self._first = 0.5 * (side - 1)
-        self._spots = Spots("OOPAO", self._n, side, settings, calibration, rows_first=True, **options)
-
-    @property
-    def slopes(self) -> ToolSlopes:
-        """Measurement of this source."""
-        return self._spots.measured
+    def __init__(self, wfs: Any, data: Any, predict: object, slopes: ToolSlopes) -> None:
+        self.wfs, self.data, self.slopes, self._predict = wfs, data, slopes, predict
+        self._n, self._side = len(slopes.pipeline.layout), slopes.pipeline.layout.window[0]
+        self._first = 0.5 * (self._side - 1)
+        self._last: NDArray[np.float64] | None = None
 
     def positions(self, image: object) -> NDArray[np.float64]:
         """Return positions; see `OOPAOAttachment._centroid`."""
-        images, camera = self._spots.checked(image), self.wfs.cam
+        n, side = self._n, self._side
+        images, camera = np.asarray(image), self.wfs.cam
+        if images.shape != (n, side, side):
+            raise InputError(
+                f"OOPAO's images: expected shape {(n, side, side)}, got {images.shape}; attach faintspot "
+                "again after changing the sensor"
+            )
         noise_free = not np.any(camera.photonNoise) and not np.any(camera.readoutNoise)
-        reference, unit = self._reference() - self._first, float(self.wfs.slopes_units)
-        found = self._spots.places(images, reference, unit, noise_free=noise_free)
+        noise_free = noise_free or self.slopes.noise_free
+        reference, unit, prior = self._reference() - self._first, float(self.wfs.slopes_units), None
+        if not noise_free:
+            expected = predicted(self._predict, self._last, (2 * n,))
+            if expected is not None:
+                prior = (expected.reshape(2, n) * unit + reference)[::-1].ravel()
+        found = self.slopes.measure(images.reshape(-1, side), prior_px=prior, noise_free=noise_free)[::-1]
+        found = np.where(self.slopes.last.measured, found, reference)
+        if not noise_free:
+            self._last = ((found - reference) / unit).ravel()
         return np.ascontiguousarray((found + self._first).T)
 
     def _reference(self) -> NDArray[np.float64]:

@@ -18,7 +18,7 @@ OUTLIER_PX = 1.0
 scale with the errors' own spread, which would forgive a worse estimator more."""
 FEWEST_PIECES = 3  # of fewer blocks or realisations, drawing again says nothing
 DRAWS = 2000
-SEED = 20150611  # of the resampling, when no generator is given: the same numbers give the same interval
+SEED = 20150611  # of the resampling: the same numbers give the same interval
 MAD_TO_STD = 1.4826
 """Standard deviation of a normal distribution in units of its median absolute deviation."""
 _LEVEL = 0.95
@@ -213,9 +213,7 @@ def paired_mean(differences: ArrayLike, comparisons: int = 1) -> Estimate:
     return Estimate(mean, error, mean - half, mean + half, count)
 
 
-def mean_by_blocks(
-    values: ArrayLike, block_length: int = 1, rng: np.random.Generator | None = None, comparisons: int = 1
-) -> Estimate:
+def mean_by_blocks(values: ArrayLike, block_length: int = 1, comparisons: int = 1) -> Estimate:
     """Return the mean of a series with its interval by a moving-block bootstrap.
 
     Kuensch 1989 (Annals of Statistics 17, 1217): blocks of neighbouring values are drawn, so that values
@@ -228,7 +226,6 @@ def mean_by_blocks(
         In the order of time.
     block_length : int
         Neighbouring values drawn together.
-    rng : numpy.random.Generator, optional
     comparisons : int
         Number of such intervals that are looked at together: all of them hold with 95 % (Bonferroni).
 
@@ -245,8 +242,7 @@ def mean_by_blocks(
     value = float(series.mean())
     if blocks < FEWEST_PIECES:
         return Estimate(value, count=blocks)
-    rng = np.random.default_rng(SEED) if rng is None else rng
-    starts = rng.integers(0, count - length + 1, (DRAWS, blocks))
+    starts = np.random.default_rng(SEED).integers(0, count - length + 1, (DRAWS, blocks))
     drawn = series[starts[:, :, None] + np.arange(length)].reshape(DRAWS, -1)[:, :count].mean(axis=1)
     return of_draws(value, drawn, blocks, comparisons)
 

@@ -247,20 +247,20 @@ def _check_first(command: click.Command, check: Callable[[str], None]) -> None:
     command.callback = checked
 
 
-def can_make(what: str, extra: str, *packages: str, asked: bool = False) -> bool:
-    """Tell whether a command can make a part of its output; if not, say so now, and that it is left out.
+def can_make(what: str, *packages: str, asked: bool = False) -> bool:
+    """Tell whether a command can make a part of its report; if not, say so now, and that it is left out.
 
     Parameters
     ----------
     what : str
         The part, such as "picture".
-    extra, packages : str
-        As for `needs`.
+    packages : str
+        Packages of the extra "report" that it needs.
     asked : bool
         Whether the user asked for it: then its absence is an error.
     """
     try:
-        require(extra, *packages, purpose=f"A {what}")
+        require("report", *packages, purpose=f"A {what}")
     except MissingExtraError as error:
         if asked:
             raise

@@ -53,7 +53,7 @@ def command(output: str, frames: int, seed: int) -> None:
       faintspot demo -o /tmp/demo --frames 2000
     """
     folder = Path(output)
-    with_report = can_make("report page", "report", "matplotlib", "jinja2")
+    with_report = can_make("report page", "matplotlib", "jinja2")
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:

@@ -67,7 +67,7 @@ def wrapped(lines: list[str], console: Console, indent: str = "") -> list[str]:
 
 def picture_file(target: Path, picture: str | None, ending: str) -> Path | None:
     """Return where the picture goes; None, said now, where it cannot be drawn and was not asked for."""
-    if not can_make("picture", "report", "matplotlib", asked=picture is not None):
+    if not can_make("picture", "matplotlib", asked=picture is not None):
         return None
     return Path(picture) if picture else derived(target, ending)
 

@@ -168,7 +168,7 @@ def _write_flattening(
     )
     save_command(target, flat.command)
     click.echo(f"command: {target}")
-    if can_make("picture", "report", "matplotlib"):
+    if can_make("picture", "matplotlib"):
         write_picture(flattening_figure(flat, wavefront, after, layout), target.with_suffix(".png"))
 
 

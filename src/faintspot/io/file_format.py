@@ -184,12 +184,12 @@ def with_absent(variables: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def json_values(name: str, value: Mapping[str, object]) -> dict[str, Any]:
-    """Return a mapping as plain JSON values: NumPy numbers, arrays and paths are converted."""
+def json_values(attributes: Mapping[str, object]) -> dict[str, Any]:
+    """Return attributes as plain JSON values: NumPy numbers, arrays and paths are converted."""
     try:
-        values: dict[str, Any] = plain_values(value, exact=True)
+        values: dict[str, Any] = plain_values(attributes, exact=True)
     except (TypeError, ValueError) as error:
-        raise InputError(f"{name}: expected numbers, texts and lists of them ({error})") from None
+        raise InputError(f"attributes: expected numbers, texts and lists of them ({error})") from None
     return values
 
 

@@ -99,7 +99,7 @@ def create_writer(
         if is_finished and (export is None or not store_path.exists()):
             return SlopeWriter(path, run)
         if measured_attributes is not None:
-            more = json_values("attributes", measured_attributes())
+            more = json_values(measured_attributes())
             run = replace(run, attributes={**run.attributes, **more})
         if not present("zarr") and not store_path.exists():
             check_memory(path, *run.sizes)
@@ -218,7 +218,7 @@ def _checked_run(
         if array.shape != (subapertures,):
             raise InputError(f"coordinates: {name}: expected shape ({subapertures},), got {array.shape}")
         values[name] = array.astype(np.float64 if array.dtype.kind == "f" else np.int64)
-    return RecordingHeader(frames, subapertures, json_values("attributes", attributes), values)
+    return RecordingHeader(frames, subapertures, json_values(attributes), values)
 
 
 def _is_finished(path: Path, file_format: FileFormat, run: RecordingHeader, *, resume: bool) -> bool:

@@ -151,10 +151,10 @@ ARRAYS: dict[str, ArrayStorage] = {
 }
 
 
-def item_type(
-    item: str, sizes: Mapping[str, int], without: Collection[str] = (), *, align: bool = False
-) -> np.dtype[np.void]:
+def item_type(item: str, sizes: Mapping[str, int], without: Collection[str] = ()) -> np.dtype[np.void]:
     """Return the type of a record ("frame") or of an "image": `sequence`, and the arrays of `Telemetry`.
+
+    Each array begins at a multiple of its numbers' size.
 
     Parameters
     ----------
@@ -163,15 +163,13 @@ def item_type(
         Sizes of the other dimensions.
     without : collection of str
         Arrays to leave out.
-    align : bool
-        Whether each array begins at a multiple of its numbers' size.
     """
     columns: list[object] = [(_NOT_STORED, np.int64)]
     for name, stored in ARRAYS.items():
         first, *others = stored.dimensions
         if first == item and name not in without:
             columns.append((name, stored.dtype, tuple(sizes[other] for other in others)))
-    return np.dtype(columns, align=align)
+    return np.dtype(columns, align=True)
 
 
 def read_telemetry(path: str | Path, *, images: bool = True) -> Telemetry:

@@ -208,7 +208,7 @@ def test_block_intervals_hold_as_often_as_they_say() -> None:
     rng = np.random.default_rng(8)
     inside = 0
     for _ in range(300):
-        found = mean_by_blocks(rng.normal(1.0, 0.5, 40), 1, rng)
+        found = mean_by_blocks(rng.normal(1.0, 0.5, 40))
         inside += found.low <= 1.0 <= found.high
     assert 0.91 <= inside / 300 <= 0.99
 

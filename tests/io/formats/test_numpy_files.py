@@ -25,9 +25,7 @@ from faintspot.io import open_frames, read_array
     ],
 )
 @pytest.mark.parametrize("ending", ["npy", "npz"])
-def test_arrays_that_are_no_frames(
-    tmp_path: Path, array: NDArray[Any], parts: tuple[str, ...], ending: str
-) -> None:
+def test_no_frames(tmp_path: Path, array: NDArray[Any], parts: tuple[str, ...], ending: str) -> None:
     path = tmp_path / f"a.{ending}"
     if ending == "npy":
         np.save(path, array, allow_pickle=True)

@@ -39,14 +39,14 @@ def record_type(n: int, commands: int = 0) -> np.dtype[np.void]:
     `sequence` counts the records from 0. Without commands, it has neither these nor the loop's state.
     """
     without = () if commands else ("loop", "commands")
-    return item_type("frame", {"subaperture": n, "command": commands}, without, align=True)
+    return item_type("frame", {"subaperture": n, "command": commands}, without)
 
 
 def image_type(frame_shape: tuple[int, int], n: int, window: tuple[int, int]) -> np.dtype[np.void]:
     """Return the type of an item of the ring of images: the frame, ADU, and denoised images, electrons."""
     names = ("row", "column", "window_row", "window_column")
     sizes = dict(zip(names, (*frame_shape, *window), strict=True))
-    return item_type("image", {**sizes, "subaperture": n}, align=True)
+    return item_type("image", {**sizes, "subaperture": n})
 
 
 class Ring:
