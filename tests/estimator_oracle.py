@@ -20,7 +20,7 @@ from tests import naive
 from tests import naive_estimators as oracle
 from tests.estimator_cases import Case, assert_sane
 from tests.naive_estimators import Estimate, Task
-from tests.naive_spots import PHASES, Floats, Spot, spots_of
+from tests.naive_spots import Floats, Spot, spots_of
 
 import faintspot as fs
 from faintspot.slopes.estimators.spot_tables import posterior_grid
@@ -72,7 +72,7 @@ def tasks(case: Case) -> list[Task]:
                 excess=excess,
                 weight_floor=own["weight_floor"][s],
                 model_error=own["model_error"][s],
-                search_range=(search[s], search[s]),
+                search_range=search[s],
                 steps=settings.steps if "steps" in settings.declared() else 0,
                 error_scale=case.each("error_scale")[s],
                 prior=(0.0, 0.0) if case.prior is None else tuple(case.prior[s]),
@@ -80,7 +80,6 @@ def tasks(case: Case) -> list[Task]:
                 weight_fwhm=own["weight_fwhm_px"][s],
                 spot_fwhm=math.sqrt(case.each("spot_fwhm_px")[s] * case.each("spot_fwhm_y_px")[s]),
                 axis_ratio=case.each("spot_fwhm_y_px")[s] / case.each("spot_fwhm_px")[s],
-                phases=PHASES,
             )
         )
     return made

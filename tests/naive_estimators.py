@@ -16,7 +16,6 @@ from tests.naive_spots import Floats, Spot, phase_margins, pixel_centres, window
 
 FWHM_PER_STD = 2 * math.sqrt(2 * math.log(2))
 START_STD_PER_FWHM = 0.73
-STEPS = {"ml": 4, "map": 4, "weighted": 8}
 LEAST_VARIANCE, LEAST_FLUX = 1e-4, 1e-2
 MOST_MODEL_ERROR_E = 300.0
 LEAST_FRACTION = 0.05
@@ -34,12 +33,11 @@ class Task:
     excess: float = 1.0
     weight_floor: float = 1e-3
     model_error: float = 0.0
-    search_range: tuple[float, float] | None = None
-    """Along x and y; None is half the window. It never leaves the window."""
-    reference: tuple[float, float] = (0.0, 0.0)
-    reach: int | None = None
-    """Of the taps of the start's smoothing, px; None is 2.5 standard deviations on each axis."""
-    steps: int | None = None
+    search_range: float = math.inf
+    """It never leaves the window."""
+    reach: int = 0
+    """Of the taps of the start's smoothing, px."""
+    steps: int = 0
     error_scale: float = 1.0
     whole_electrons: Any = False
     """Whether pixels are rounded, one answer or one for each."""
@@ -47,8 +45,6 @@ class Task:
     """Whether a constant is a fourth parameter of the fit."""
     prior: tuple[float, float] = (0.0, 0.0)
     prior_std: float = math.inf
-    phases: int | None = None
-    """Of the table of the weight."""
     weight_fwhm: float = 2.0
     spot_fwhm: float = 2.0
     axis_ratio: float = 1.0
@@ -64,22 +60,14 @@ class Task:
             return total
         return total + float(np.finfo(np.float32).eps * np.abs(values).sum() * self.rounding.uniform(-1, 1))
 
-    @property
-    def mean_variance(self) -> float:
-        return float(np.mean(self.variance))
-
     def counted(self, g: ArrayLike) -> Floats:
         """The image with the pixels of low noise rounded."""
         return np.where(self.whole_electrons, np.rint(g), np.asarray(g, np.float64))
 
     def limits(self, shape: tuple[int, int]) -> list[tuple[float, float]]:
         """Lowest and highest x, and y."""
-        half = (shape[1] / 2, shape[0] / 2)
-        ranges = half if self.search_range is None else self.search_range
-        return [
-            (max(middle - r, -h), min(middle + r, h))
-            for middle, r, h in zip(self.reference, ranges, half, strict=True)
-        ]
+        ends = (min(self.search_range, shape[1] / 2), min(self.search_range, shape[0] / 2))
+        return [(-end, end) for end in ends]
 
 
 @dataclass
@@ -105,20 +93,13 @@ class Estimate:
 # Start ------------------------------------------------------------------------------------------------
 
 
-def smoothing_taps(std: float, reach: int | None = None) -> Floats:
-    """Weights of a Gaussian at whole pixels out to ceil(2.5 std), their sum 1."""
-    reach = math.ceil(2.5 * std) if reach is None else reach
-    taps = np.exp(-0.5 * (np.arange(-reach, reach + 1) / std) ** 2) if std > 0 else np.ones(1)
-    return np.asarray(taps / taps.sum())
-
-
-def smoothed(g: ArrayLike, std_x: float, std_y: float, reach: int | None = None) -> Floats:
-    """Gaussian smoothing; outside the image there is nothing."""
+def smoothed(g: ArrayLike, std_x: float, std_y: float, reach: int) -> Floats:
+    """Gaussian smoothing with taps of sum 1; outside the image there is nothing."""
     result: Any = np.asarray(g, np.float64)
     for axis, std in ((0, std_y), (1, std_x)):
-        taps = smoothing_taps(std, reach)
-        k = len(taps) // 2
-        padded = np.pad(result, [(k, k) if a == axis else (0, 0) for a in (0, 1)])
+        taps = np.exp(-0.5 * (np.arange(-reach, reach + 1) / std) ** 2)
+        taps /= taps.sum()
+        padded = np.pad(result, [(reach, reach) if a == axis else (0, 0) for a in (0, 1)])
         n = result.shape[axis]
         result = sum(tap * np.take(padded, np.arange(k, k + n), axis=axis) for k, tap in enumerate(taps))
     return np.asarray(result)
@@ -133,7 +114,7 @@ def start(g: ArrayLike, task: Task) -> Estimate:
     g = np.array(g, np.float64)
     g -= g.mean() if task.background else 0.0
     if np.ndim(task.variance):
-        mean = max(task.mean_variance, LEAST_VARIANCE)
+        mean = max(float(np.mean(task.variance)), LEAST_VARIANCE)
         g *= np.minimum(mean / np.maximum(task.variance, LEAST_VARIANCE), 1.0)
     std_x, std_y = (START_STD_PER_FWHM * width for width in task.fwhm)
     blurred = smoothed(g, std_x, std_y, task.reach)
@@ -144,13 +125,12 @@ def start(g: ArrayLike, task: Task) -> Estimate:
             if low_x - 0.5 <= x <= high_x + 0.5 and low_y - 0.5 <= y <= high_y + 0.5:
                 found.append((blurred[j, i], x, y))
     if not found:
-        return Estimate(*task.reference, flux=1.0)
+        return Estimate(0.0, 0.0, flux=1.0)
     best = max(found, key=lambda item: item[0])
     others = [item[0] for item in found if item is not best]
-    flux = 1.0
-    if task.spot is not None:
-        peak = smoothed_peak(task.spot, std_x, std_y, task.reach, (g.shape[0], g.shape[1]), task.background)
-        flux = max(best[0] / peak, 1.0)
+    assert task.spot is not None
+    peak = smoothed_peak(task.spot, std_x, std_y, task.reach, (g.shape[0], g.shape[1]), task.background)
+    flux = max(best[0] / peak, 1.0)
     distance = best[0] - max(others, default=-math.inf)
     x, y = clamp(best[1], low_x, high_x), clamp(best[2], low_y, high_y)
     return Estimate(x, y, flux, margin=100 * distance / max(np.abs(blurred).max(), 1e-30))
@@ -158,7 +138,7 @@ def start(g: ArrayLike, task: Task) -> Estimate:
 
 @cache
 def smoothed_peak(
-    spot: Spot, std_x: float, std_y: float, reach: int | None, shape: tuple[int, int], background: bool
+    spot: Spot, std_x: float, std_y: float, reach: int, shape: tuple[int, int], background: bool
 ) -> float:
     """The smoothed image's middle pixel for a spot of 1 e-, the mean over places of the spot in it."""
     j, i = shape[0] // 2, shape[1] // 2
@@ -202,21 +182,20 @@ def information(m: Floats, dm: list[Floats], w: Floats, task: Task, name: str) -
     return i, j
 
 
-def fisher(g: ArrayLike, task: Task, name: str = "ml", begin: Estimate | None = None) -> Estimate:
+def fisher(g: ArrayLike, task: Task, name: str, begin: Estimate) -> Estimate:
     """Fisher scoring in x, y, flux and, where it is unknown, background; errors as before the last step.
 
     A move that is cut short leaves the others to what they then should be: along a limit the other axis is
     solved for again, flux and background last. Without information on the place it stays.
     """
     assert task.spot is not None
-    g = task.counted(g) if name in ("ml", "map") else np.asarray(g, np.float64)
-    begin = start(g, task) if begin is None else begin
+    g = task.counted(g)
     limits, margin = task.limits(g.shape), begin.margin
     x, y, flux = clamp(begin.x, *limits[0]), clamp(begin.y, *limits[1]), begin.flux
     level, most = 0.0, largest_move(*task.fwhm)
     moves: tuple[float, ...] = (most,)
     errors = (math.inf, math.inf)
-    for _ in range(STEPS[name] if task.steps is None else task.steps):
+    for _ in range(task.steps):
         f, fx, fy = task.spot.images(x, y, g.shape)
         m, dm = flux * f, [flux * fx, flux * fy, f] + [np.ones_like(f)] * task.background
         w = weights(m, task, begin.flux)
@@ -224,7 +203,7 @@ def fisher(g: ArrayLike, task: Task, name: str = "ml", begin: Estimate | None = 
         if name == "map":
             score[:2] += (np.array(task.prior) - (x, y)) / task.prior_std**2
         i, j = information(m, dm, w, task, name)
-        margin = min(margin, soundness(i) - 1e-3, *phase_margins(x, y, g.shape, task.spot.phases))
+        margin = min(margin, soundness(i) - 1e-3, *phase_margins(x, y, g.shape))
         whole = np.linalg.solve(i, score) if soundness(i) > 1e-5 else np.zeros(len(score))
         growth = max(1.0, whole[2] / flux)
         move = np.clip(whole[:2] / growth, -most, most)
@@ -262,20 +241,16 @@ def sandwich(i: Floats, j: Floats) -> tuple[float, float]:
     return math.sqrt(covariance[0, 0]), math.sqrt(covariance[1, 1])
 
 
-def grid_posterior(
-    g: ArrayLike, task: Task, flux: float, xs: ArrayLike, ys: ArrayLike, cell: float | None = None
-) -> Estimate:
+def grid_posterior(g: ArrayLike, task: Task, flux: float, xs: Floats, ys: Floats, cell: float) -> Estimate:
     """Mean and standard deviation of the posterior on a grid of positions, the flux known.
 
-    The likelihood is the Poisson distribution's of (g + v / e) / e with mean (m + v / e) / e. With `cell`,
-    the grid's spacing, positions count with what of their cell is within the limits; those more than
-    PRIOR_REACH standard deviations from the prior on an axis do not count. Where none is left, the prior is
-    all there is.
+    The likelihood is the Poisson distribution's of (g + v / e) / e with mean (m + v / e) / e. Positions
+    count with what of their cell of the grid is within the limits; those more than PRIOR_REACH standard
+    deviations from the prior on an axis do not count. Where none is left, the prior is all there is.
     """
     assert task.spot is not None
     g = np.asarray(g, np.float64)
     v, e = task.variance, task.excess
-    xs, ys = np.asarray(xs, np.float64), np.asarray(ys, np.float64)
     (low_x, high_x), (low_y, high_y) = task.limits(g.shape)
     logarithm = np.full((len(ys), len(xs)), -np.inf)
     for j, y in enumerate(ys):
@@ -283,12 +258,10 @@ def grid_posterior(
             m = np.maximum(flux * task.spot.images(x, y, g.shape)[0], 0.0)
             q = (g + v / e) / e * np.log(1.0 + e * m / v) - m / e
             distance = ((x - task.prior[0]) ** 2 + (y - task.prior[1]) ** 2) / task.prior_std**2
-            share = 1.0
-            if cell is not None:
-                share = max(min(x + cell / 2, high_x) - max(x - cell / 2, low_x), 0.0)
-                share *= max(min(y + cell / 2, high_y) - max(y - cell / 2, low_y), 0.0)
-                away = max(abs(x - task.prior[0]), abs(y - task.prior[1]))
-                share *= away <= PRIOR_REACH * task.prior_std
+            share = max(min(x + cell / 2, high_x) - max(x - cell / 2, low_x), 0.0)
+            share *= max(min(y + cell / 2, high_y) - max(y - cell / 2, low_y), 0.0)
+            away = max(abs(x - task.prior[0]), abs(y - task.prior[1]))
+            share *= away <= PRIOR_REACH * task.prior_std
             if share > 0:
                 logarithm[j, i] = task.rounded_sum(q) - distance / 2 + math.log(share)
     if np.isneginf(logarithm).all():
@@ -304,13 +277,12 @@ def grid_posterior(
 # Centres of gravity -----------------------------------------------------------------------------------
 
 
-def weighted(g: ArrayLike, task: Task, begin: Estimate | None = None) -> Estimate:
+def weighted(g: ArrayLike, task: Task, begin: Estimate) -> Estimate:
     """Centre of gravity under a Gaussian window that follows it; error of the last step alone.
 
     Less flux under the window than LEAST_FRACTION of the start's counts as that much.
     """
     g = np.asarray(g, np.float64)
-    begin = start(g, task) if begin is None else begin
     limits, margin = task.limits(g.shape), begin.margin
     x, y = clamp(begin.x, *limits[0]), clamp(begin.y, *limits[1])
     gain = 1.0 + (task.spot_fwhm / task.weight_fwhm) ** 2  # both as geometric means of the axes
@@ -321,9 +293,9 @@ def weighted(g: ArrayLike, task: Task, begin: Estimate | None = None) -> Estimat
     w, total = np.ones_like(g), floor
     most = largest_move(*(task.spot_fwhm * task.axis_ratio**power for power in (-0.5, 0.5)))
     moves: tuple[float, ...] = (most,)
-    for _ in range(STEPS["weighted"] if task.steps is None else task.steps):
-        margin = min(margin, *phase_margins(x, y, g.shape, task.phases))
-        w = np.outer(window(g.shape[0], y, std_y, task.phases), window(g.shape[1], x, std_x, task.phases))
+    for _ in range(task.steps):
+        margin = min(margin, *phase_margins(x, y, g.shape))
+        w = np.outer(window(g.shape[0], y, std_y), window(g.shape[1], x, std_x))
         total = max(float(np.sum(w * g)), floor)
         move_x, move_y = (gain * np.sum(w * g * away) / total for away in (u - x, v - y))
         move_x, move_y = clamp(move_x, -most, most), clamp(move_y, -most, most)
@@ -351,27 +323,25 @@ def fixed_window(
     assert task.spot is not None
     g = np.asarray(g, np.float64)
     ny, nx = g.shape
-    x0, y0 = task.reference
     std_x = window_fwhm / FWHM_PER_STD / math.sqrt(task.axis_ratio)
     std_y = window_fwhm / FWHM_PER_STD * math.sqrt(task.axis_ratio)
-    spot = task.spot.images(x0, y0, g.shape)[0]
+    spot = task.spot.images(0.0, 0.0, g.shape)[0]
     weights = np.zeros((3, ny, nx))
     for j, v in enumerate(pixel_centres(ny)):
         for i, u in enumerate(pixel_centres(nx)):
-            w = math.exp(-0.5 * (((u - x0) / std_x) ** 2 + ((v - y0) / std_y) ** 2))
-            if w >= 1e-4 and max(abs(u - x0), abs(v - y0)) < region / 2:
-                weights[:, j, i] = w * (u - x0), w * (v - y0), w
-    for axis, step in enumerate(((0.25, 0.0), (0.0, 0.25))):
-        ahead = task.spot.images(x0 + step[0], y0 + step[1], g.shape)[0]
-        behind = task.spot.images(x0 - step[0], y0 - step[1], g.shape)[0]
+            w = math.exp(-0.5 * ((u / std_x) ** 2 + (v / std_y) ** 2))
+            if w >= 1e-4 and max(abs(u), abs(v)) < region / 2:
+                weights[:, j, i] = w * u, w * v, w
+    for axis, (x, y) in enumerate(((0.25, 0.0), (0.0, 0.25))):
+        ahead, behind = (task.spot.images(sign * x, sign * y, g.shape)[0] for sign in (1, -1))
         seen = float(np.sum(weights[axis] * (ahead - behind))) / 0.5
         weights[axis] /= max(seen, 0.02) if gain is None else gain
     weights[2] /= max(float(np.sum(weights[2] * spot)), 0.02)
     flux = float(np.sum(weights[2] * g))
     divisor = flux if divisor is None else divisor
     found, errors = [], []
-    for axis, home in enumerate((x0, y0)):
-        found.append(home + float(np.sum(weights[axis] * g)) / divisor - float(np.sum(weights[axis] * spot)))
+    for axis in range(2):
+        found.append(float(np.sum(weights[axis] * g)) / divisor - float(np.sum(weights[axis] * spot)))
         noise = weights[axis] ** 2 * (task.variance + task.excess * divisor * np.maximum(spot, 0.0))
         errors.append(task.error_scale * math.sqrt(max(float(noise.sum()), 0.0)) / divisor)
     return Estimate(found[0], found[1], flux, errors[0], errors[1])

@@ -30,44 +30,40 @@ def b_spline_derivative(t: Floats) -> Floats:
     return steepness * np.sign(t)
 
 
-def window(n: int, place: float, std: float, phases: int | None = None) -> Floats:
-    """A Gaussian of height 1 along one axis; with `phases` continued from the nearest of its table."""
-    tabulated = nearest_phase(n, place, phases)
+def window(n: int, place: float, std: float) -> Floats:
+    """A Gaussian of height 1 along one axis, continued from the nearest of its table."""
+    tabulated = nearest_phase(n, place)
     away = pixel_centres(n) - tabulated
     value = np.exp(-0.5 * (away / std) ** 2)
     return np.asarray(value + (place - tabulated) * value * away / std**2)
 
 
-def nearest_phase(n: int, place: float, phases: int | None) -> float:
-    """The place nearest to this one that a table of so many phases a pixel holds."""
-    if phases is None:
-        return place
+def nearest_phase(n: int, place: float) -> float:
+    """The place nearest to this one that a table holds."""
     first = -(n - 1) / 2
-    return first - math.floor((first - place) * phases + 0.5) / phases
+    return first - math.floor((first - place) * PHASES + 0.5) / PHASES
 
 
-def phase_margins(x: float, y: float, shape: tuple[int, int], phases: int | None) -> list[float]:
+def phase_margins(x: float, y: float, shape: tuple[int, int]) -> list[float]:
     """How far x and y are from where the nearest phase changes, phases."""
-    if phases is None:
-        return [math.inf]
-    return [abs((((n - 1) / 2 + place) * phases) % 1.0 - 0.5) for n, place in ((shape[1], x), (shape[0], y))]
+    return [abs((((n - 1) / 2 + place) * PHASES) % 1.0 - 0.5) for n, place in ((shape[1], x), (shape[0], y))]
 
 
 class Spot:
     """One effective PSF (rows, columns): the cubic spline through its nodes, zero outside.
 
-    With `phases`, what a table of its profiles holds: spline and derivatives at so many places a pixel; at
+    If tabulated, what a table of its profiles holds: spline and derivatives at PHASES places a pixel; at
     others the value is continued from the nearest by the derivative, which itself is taken as it is there.
     """
 
-    def __init__(self, samples: ArrayLike, oversampling: int, phases: int | None = None) -> None:
+    def __init__(self, samples: ArrayLike, oversampling: int, is_tabulated: bool) -> None:
         self.coefficients = spline_filter(np.pad(np.asarray(samples, np.float64), 2), 3, mode="mirror")
         self.oversampling = oversampling
-        self.phases = phases
+        self.is_tabulated = is_tabulated
 
     def _axis(self, n: int, place: float, count: int) -> tuple[Any, Floats, Floats]:
         """The four nodes that matter to each of n pixels; factors for the value and the derivative."""
-        tabulated = nearest_phase(n, place, self.phases)
+        tabulated = nearest_phase(n, place) if self.is_tabulated else place
         at = self.oversampling * (pixel_centres(n) - tabulated) + (count - 1) / 2
         nodes = np.floor(at).astype(int)[:, None] + np.arange(-1, 3)
         t = at[:, None] - nodes
@@ -94,4 +90,4 @@ def spots_of(psf: PSF, *, tabulated: bool = False) -> list[Spot]:
     if tabulated:
         along_x, along_y = psf.separable_terms
         samples = np.einsum("kti,ktj->kij", along_y, along_x)
-    return [Spot(plane, psf.oversampling, PHASES if tabulated else None) for plane in samples]
+    return [Spot(plane, psf.oversampling, tabulated) for plane in samples]
