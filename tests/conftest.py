@@ -1,4 +1,4 @@
-"""Settings of Hypothesis, Ctrl-C, and cheap pictures for the tests of pages.
+"""Settings of Hypothesis, Ctrl-C, commands, and cheap pictures for the tests of pages.
 
 Hypothesis draws the same examples in every run, and has no deadline, because the first call of a kernel
 compiles it. `pytest --hypothesis-profile=thorough --hypothesis-seed=N` draws 40 times as many at random.
@@ -51,6 +51,14 @@ def no_processes(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch
 
     monkeypatch.setattr(multiprocessing.process.BaseProcess, "start", refuse)
     monkeypatch.setattr(subprocess.Popen, "__init__", refuse)
+
+
+@pytest.fixture
+def run(capsys: pytest.CaptureFixture[str]) -> Any:
+    """Return what runs commands in this process."""
+    from tests.cli.cli_cases import Commands
+
+    return Commands(capsys)
 
 
 @pytest.fixture

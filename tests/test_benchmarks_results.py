@@ -51,9 +51,7 @@ def options(folder: Path) -> list[str]:
 
 @pytest.mark.usefixtures("made_up")
 def test_a_benchmark_that_fails_does_not_end_the_others(tmp_path: Path) -> None:
-    answer = CliRunner().invoke(
-        command.run, ["scale", "rivals", "--folder", str(tmp_path), "--pages", str(tmp_path / "pages")]
-    )
+    answer = CliRunner().invoke(command.run, ["scale", "rivals", *options(tmp_path)])
     assert answer.exit_code == 1
     assert "[2/2] rivals" in answer.output
     (path,) = results.newest_first(tmp_path)
@@ -82,9 +80,7 @@ def test_named_benchmarks_write_what_the_pages_show(tmp_path: Path) -> None:
 
 @pytest.mark.usefixtures("made_up")
 def test_an_interrupted_run_keeps_what_was_finished(tmp_path: Path) -> None:
-    answer = CliRunner().invoke(
-        command.run, ["rivals", "estimators", "--folder", str(tmp_path), "--pages", str(tmp_path / "pages")]
-    )
+    answer = CliRunner().invoke(command.run, ["rivals", "estimators", *options(tmp_path)])
     assert answer.exit_code == 1
     (path,) = results.newest_first(tmp_path)
     assert [each.name for each in results.read(path).benchmarks] == ["rivals"]

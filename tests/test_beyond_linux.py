@@ -10,7 +10,7 @@ import click
 import numpy as np
 import pytest
 from tests.beyond_linux import POSIX_MODULES
-from tests.cli.cli_cases import CONFIGURATION, Commands, assert_equal, expected, simulated
+from tests.cli.cli_cases import CONFIGURATION, STUDY, Commands, assert_equal, expected, simulated
 
 import faintspot as fs
 from faintspot import InputError
@@ -18,15 +18,6 @@ from faintspot.base import errors
 from faintspot.cli.realtime import command as realtime
 
 SCRIPT = Path(__file__).with_name("beyond_linux.py")
-STUDY = """
-name = "small"
-realisations = 200
-
-[sweeps.flux]
-flux_e = [30, 100]
-"""
-
-
 MEASURE = "slopes frames.npy --config faintspot.toml -o slopes.zarr"
 
 
@@ -120,10 +111,7 @@ def test_real_time_needs_linux(monkeypatch: pytest.MonkeyPatch) -> None:
             command.callback()
 
 
-def test_the_other_ways_into_real_time_say_so_too(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    run = Commands(capsys)
+def test_other_ways_into_real_time(run: Commands, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(errors, "SHARED_MEMORY", tmp_path / "none")
     for line in ("live", "realtime demo"):
         run.refused(*line.split(), naming=("needs shared memory", "which Linux has"))

@@ -245,17 +245,6 @@ class TestRefused:
     IMAGES = np.ones((3, 8, 8), np.float32)
     NOISE = fs.Calibration(dark=0.0, read_noise_e=1.0)
 
-    def test_parts_for_another_sensor(self) -> None:
-        ml = fs.Settings(estimator="ml")
-        psf = PSF(one_psf().samples, 8, [0, 0])
-        with refused("psf.index", "3 numbers", "got 2"):
-            measure_images(self.IMAGES, ml, calibration=self.NOISE, psf=psf)
-        with refused("flux_e", "3 values", "got 2"):
-            chosen = fs.Settings(estimator="ml", flux_e=[1.0, 2.0])
-            measure_images(self.IMAGES, chosen, calibration=self.NOISE, psf=one_psf())
-        with refused("keep_brightest = 65"):
-            measure_images(self.IMAGES, fs.Settings(estimator="smoothed", keep_brightest=65))
-
     @pytest.mark.parametrize("number", [np.nan, np.inf, -1e39, 1e39, 1e6])
     def test_a_reference_that_no_frame_can_hold(self, number: float) -> None:
         case = random_case(1, "brightest", n=5, window=(8, 8))

@@ -109,23 +109,14 @@ def test_refused_in_one_line() -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (
-            {"valid_sub_aps": np.ones((6, 4), bool)},
-            r"valid_sub_aps: expected shape \(6, 3\) for 3 x 3 sub-ap",
-        ),
-        (
-            {"valid_sub_aps": np.zeros((6, 3), bool)},
-            "valid_sub_aps: expected at least one valid sub-aperture",
-        ),
-        ({"ref_slopes": np.zeros((4, 2))}, r"ref_slopes: expected shape \(6, 3\) .* got \(4, 2\); remake it"),
-        (
-            {"ref_slopes": np.full((6, 3), np.nan)},
-            "ref_slopes: expected finite numbers, got 18 NaN or infinite",
-        ),
+        ({"valid_sub_aps": np.ones((6, 4), bool)}, "valid_sub_aps: expected shape (6, 3) for 3 x 3"),
+        ({"valid_sub_aps": np.zeros((6, 3), bool)}, "valid_sub_aps: expected at least one valid"),
+        ({"ref_slopes": np.zeros((4, 2))}, "ref_slopes: expected shape (6, 3)"),
+        ({"ref_slopes": np.full((6, 3), np.nan)}, "ref_slopes: expected finite numbers, got 18"),
     ],
 )
 def test_maps_of_another_system(change: dict[str, Any], message: str) -> None:
-    with refused(match=message):
+    with refused(message):
         measuring().maps(process(**change), frame_of(images()), no_stream)
 
 

@@ -19,9 +19,7 @@ FLAGS = np.array([[DARK, LIMITED, 0, 8], [DARK, 0, 0, 64]], np.uint8)
         (FLAGS[:, 2:], NO_FLAG, ""),
     ],
 )
-def test_line_counts_whole_subapertures_and_single_slopes(
-    flags: np.ndarray, keep: SubapertureFlag, line: str
-) -> None:
+def test_line_counts_subapertures_and_slopes(flags: np.ndarray, keep: SubapertureFlag, line: str) -> None:
     valid, said = leave_out(flags, keep)
     assert said == line
     np.testing.assert_array_equal(valid, are_valid(flags, keep))

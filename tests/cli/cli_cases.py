@@ -29,6 +29,13 @@ name = "tv"
 noise_std = 2.0
 keep_brightest = 10
 """
+STUDY = """
+name = "small"
+realisations = 200
+
+[sweeps.flux]
+flux_e = [30, 100]
+"""
 
 
 @dataclass

@@ -3,12 +3,7 @@
 from pathlib import Path
 
 import pytest
-from tests.cli.cli_cases import CONFIGURATION, Commands
-
-
-@pytest.fixture
-def run(capsys: pytest.CaptureFixture[str]) -> Commands:
-    return Commands(capsys)
+from tests.cli.cli_cases import CONFIGURATION
 
 
 @pytest.fixture

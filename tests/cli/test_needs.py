@@ -11,7 +11,7 @@ import pytest
 from tests.cli.cli_cases import Commands
 from tests.shared_data import ROOT
 
-from faintspot.base.errors import EXTRAS, present, require
+from faintspot.base.errors import EXTRAS
 from faintspot.cli import group
 
 pytestmark = pytest.mark.slow
@@ -111,14 +111,6 @@ def test_the_rest_is_done_and_what_is_left_out_is_said(tmp_path: Path) -> None:
     assert made == {"frames.npy", "truth.npy", "tv.toml", "tv.npz", "no-tv.toml", "no-tv.npz"}
     for name in ("found.toml", "slopes.npz", "wavefront.json", "tuned.toml"):
         assert (tmp_path / name).exists()
-
-
-def test_present_and_require(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert present("numpy")
-    assert not present("no_such_package_at_all")
-    require("io", "numpy", purpose="This")
-    monkeypatch.setitem(sys.modules, "zarr", None)
-    assert not present("zarr")
 
 
 def test_extras_are_those_of_the_package() -> None:

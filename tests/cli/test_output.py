@@ -54,9 +54,7 @@ def test_a_bar_that_never_moved_leaves_no_trace(capsys: pytest.CaptureFixture[st
     assert capsys.readouterr() == ("", "")
 
 
-def test_in_a_notebook_without_widgets_as_in_a_file(
-    shown: list[Any], capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_in_a_notebook_without_widgets(shown: list[Any], capsys: pytest.CaptureFixture[str]) -> None:
     count_to(4)
     assert "4/4" in capsys.readouterr().err
     assert shown == []

@@ -22,6 +22,9 @@ def test_slopes_are_written_in_every_format(folder: Path, run: Commands, name: s
     fits.PrimaryHDU(frames).writeto(folder / "a.fits.gz")
     result = run.ok("slopes", "a.fits.gz", "-o", name)
     assert_equal(folder / name, expected(frames))
+    assert "30/30" in result.error
+    assert "frames/s" in result.error
+    assert not any(character in result.out + result.err for character in "\r\x1b")
     first, *_, last = result.out.splitlines()
     assert first == f"{name}: 30 frames, 16 sub-apertures"
     quoted = f"'{name}'" if " " in name else name
@@ -62,16 +65,6 @@ def test_reference_is_subtracted_and_stored(folder: Path, run: Commands) -> None
     assert_equal(folder / "s.npz", expected(frames, reference=reference))
     np.testing.assert_array_equal(read_slopes(folder / "s.npz").attributes["reference"], reference)
     run.refused("slopes", "a.npy", "-o", "t.npz", "--reference", "r.npz:other", naming=("(16, 2)", "(3, 2)"))
-
-
-@pytest.mark.slow
-def test_the_bar_is_one_line_on_standard_error(folder: Path, run: Commands) -> None:
-    np.save("a.npy", simulated())
-    result = run.ok("slopes", "a.npy", "--block", 3)
-    assert "30/30" in result.error
-    assert "frames/s" in result.error
-    assert "frames/s" not in result.out
-    assert not any(character in result.out + result.err for character in "\r\x1b")
 
 
 @pytest.mark.slow
@@ -154,9 +147,7 @@ def test_slopes_in_arcsec(folder: Path, run: Commands, name: str) -> None:
 
 
 @pytest.mark.slow
-def test_without_zarr_the_command_says_that_it_cannot_resume(
-    folder: Path, run: Commands, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_without_zarr_it_cannot_resume(folder: Path, run: Commands, monkeypatch: pytest.MonkeyPatch) -> None:
     np.save("a.npy", simulated())
     monkeypatch.setitem(sys.modules, "zarr", None)
     result = run.ok("slopes", "a.npy", "-o", "s.npz")
@@ -187,6 +178,7 @@ def test_one_line_names_what_cannot_be_used(folder: Path, run: Commands) -> None
         "half.fits.gz -o half.npz": ("half.fits.gz", "frames", "damaged or incomplete"),
         "large.npy": ("large.npy", "33 x 32", "32 x 32", "faintspot.toml"),
         "a.npy -c nix.toml": ("nix.toml", "no such file", "faintspot layout"),
+        "a.npy -c text.fits": ("text.fits", "not a TOML file", "line 1"),
         "a.npy --unit arcsec": ("unit", "pixel_scale_arcsec"),
         "a.npy -o s.xyz": ("s.xyz", ".zarr", ".csv"),
         "a.npy -o nix/s.npz": ("nix/s.npz", "folder nix does not exist"),
@@ -203,16 +195,3 @@ def test_one_line_names_what_cannot_be_used(folder: Path, run: Commands) -> None
     assert all(path.read_bytes() == content for path, content in before.items())
     assert Path("foreign.zarr/precious").exists()
     assert not Path("slopes.zarr").exists()
-
-
-def test_damaged_configuration_is_refused(folder: Path, run: Commands) -> None:
-    np.save("a.npy", simulated())
-    for text, naming in {
-        "not toml at all": ("not a TOML file", "line 1"),
-        "[estimator]\nname = 'tv'\nnoise_std = 2.0": ("[layout]", "estimator"),
-        CONFIGURATION.replace("= 10", "= 64"): ("keep_brightest", "64", "63"),
-        CONFIGURATION + '[calibration]\ndark = "dark.fits"': ("calibration.dark", "no such file"),
-    }.items():
-        (folder / "faintspot.toml").write_text(text)
-        run.refused("slopes", "a.npy", naming=("faintspot.toml", *naming))
-    assert not (folder / "slopes.zarr").exists()

@@ -4,7 +4,6 @@ import json
 import signal
 import subprocess
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -61,18 +60,16 @@ def start_and_stop(output: Path, number: int) -> tuple[int, str]:
 
 
 @pytest.fixture
-def prepared(folder: Path, frames: np.ndarray) -> Callable[[str], Path]:
+def prepared(folder: Path, frames: np.ndarray) -> Path:
     np.save(folder / "a.npy", frames)
     text = (folder / "faintspot.toml").read_text()
     (folder / "faintspot.toml").write_text(text + f"tolerance = 0.0\nmax_iterations = {ITERATIONS}\n")
-    return lambda name: folder / name
+    return folder
 
 
 @pytest.mark.parametrize("name", ["s.zarr", "s.npz"])
-def test_a_killed_run_goes_on_where_it_ended(
-    prepared: Callable[[str], Path], run: Commands, name: str, uninterrupted: Slopes
-) -> None:
-    output = prepared(name)
+def test_a_killed_run_is_resumed(prepared: Path, run: Commands, name: str, uninterrupted: Slopes) -> None:
+    output = prepared / name
     code, _ = start_and_stop(output, signal.SIGKILL)
     assert code == -signal.SIGKILL
     kept = finished(output)
@@ -83,10 +80,8 @@ def test_a_killed_run_goes_on_where_it_ended(
     assert_equal(output, uninterrupted)
 
 
-def test_interrupted_run_is_resumed(
-    prepared: Callable[[str], Path], run: Commands, uninterrupted: Slopes
-) -> None:
-    output = prepared("s.zarr")
+def test_interrupted_run_is_resumed(prepared: Path, run: Commands, uninterrupted: Slopes) -> None:
+    output = prepared / "s.zarr"
     code, errors = start_and_stop(output, signal.SIGINT)
     assert code == 130
     *bar, message = errors.splitlines()

@@ -7,12 +7,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from tests.cli.cli_cases import Commands, command_line
+from tests.cli.cli_cases import STUDY, Commands, command_line
 from tests.experiments.experiment_cases import SEARCH, small
 from tests.experiments.result_cases import made_up_magnitude
 
 from faintspot.cli import study as command
-from faintspot.experiments import StudySpecification, Sweep, WorkerPool, open_study, run
+from faintspot.experiments import StudySpecification, Sweep, WorkerPool, open_study
+from faintspot.experiments import run as run_study
 from faintspot.experiments.closed_loop import magnitude
 from faintspot.experiments.closed_loop.results import MagnitudeResult
 from faintspot.experiments.night import page, protocol
@@ -24,16 +25,11 @@ from faintspot.slopes.pipeline import configuration
 
 pytest.importorskip("zarr")
 pytest.importorskip("xarray")
+pytest.importorskip("matplotlib")
+pytest.importorskip("jinja2")
 
 pytestmark = pytest.mark.slow
 
-SMALL = """
-name = "small"
-realisations = 200
-
-[sweeps.flux]
-flux_e = [30, 100]
-"""
 SLOW = """
 name = "slow"
 realisations = 1500
@@ -44,9 +40,7 @@ flux_e = { from = 10, to = 1000, points = 12, spacing = "log" }
 """
 
 
-def test_estimators_study_writes_its_page(
-    folder: Path, run: Commands, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_estimators_study_has_a_page(folder: Path, run: Commands, monkeypatch: pytest.MonkeyPatch) -> None:
     sweep = Sweep("a", flux_e=[50, 200], pixels=8)
     small = StudySpecification(
         "estimators", [sweep], realisations=100, estimators=["brightest", "ml"], fixed_k=[]
@@ -58,7 +52,7 @@ def test_estimators_study_writes_its_page(
 
 
 def test_study_is_stored_resumed_and_replaced(folder: Path, run: Commands) -> None:
-    Path("my-study.toml").write_text(SMALL)
+    Path("my-study.toml").write_text(STUDY)
     first = run.ok("study", "my-study.toml", "--workers", 0)
     assert "2 of them in this run" in first.out
     assert "faintspot report my-study.zarr" in first.out
@@ -66,7 +60,12 @@ def test_study_is_stored_resumed_and_replaced(folder: Path, run: Commands) -> No
     assert open_study("my-study.zarr")["done"].all()
     again = run.ok("study", "my-study.toml", "-o", "my-study.zarr", "--workers", 0)
     assert "complete already" in again.out
-    Path("my-study.toml").write_text(SMALL.replace("200", "300"))
+    assert "my-study.html" in run.ok("report", "my-study.zarr").out
+    page = (folder / "my-study.html").read_text(encoding="utf-8")
+    assert "small" in page
+    assert "2 of 2" in page
+    run.refused("report", "my-study.zarr", "my-study.zarr", naming=("my-study.zarr",))
+    Path("my-study.toml").write_text(STUDY.replace("200", "300"))
     refused = run.refused("study", "my-study.toml", "--workers", 0, naming=("another study", "--overwrite"))
     assert "'small'" in refused.error
     run.ok("study", "my-study.toml", "--workers", 0, "--overwrite")
@@ -75,9 +74,9 @@ def test_study_is_stored_resumed_and_replaced(folder: Path, run: Commands) -> No
 
 def test_studies_that_make_no_sense_are_refused(folder: Path, run: Commands) -> None:
     run.refused("study", "nothing.toml", naming=("nothing.toml", "no such file"))
-    Path("bad.toml").write_text(SMALL + "read_noise_e = -1\n")
+    Path("bad.toml").write_text(STUDY + "read_noise_e = -1\n")
     run.refused("study", "bad.toml", naming=("bad.toml", "read_noise_e = -1"))
-    Path("bad.toml").write_text(SMALL + "sizes = 1\n")
+    Path("bad.toml").write_text(STUDY + "sizes = 1\n")
     run.refused("study", "bad.toml", naming=("did you mean size",))
     run.refused("study", "paper", "--figure", "fig99", naming=("fig99",))
     run.refused("study", "paper", "--workers", -1, naming=("--workers",))
@@ -100,31 +99,14 @@ def test_killed_and_started_again(folder: Path, run: Commands) -> None:
     assert 2 <= int(open_study(store)["done"].sum()) < 12
     run.ok("study", "slow.toml", "--workers", 0)
     whole = folder / "whole.zarr"
-    uninterrupted(whole)
+    run_study(StudySpecification.from_text(SLOW), whole, pool=WorkerPool(0))
     found, expected = (
         {str(p.relative_to(s)): p.read_bytes() for p in s.rglob("*") if p.is_file()} for s in (store, whole)
     )
     assert found == expected
 
 
-def uninterrupted(path: Path) -> None:
-    run(StudySpecification.from_text(SLOW), path, pool=WorkerPool(0))
-
-
-def test_report_of_a_study(folder: Path, run: Commands) -> None:
-    pytest.importorskip("matplotlib")
-    pytest.importorskip("jinja2")
-    Path("my-study.toml").write_text(SMALL)
-    run.ok("study", "my-study.toml", "--workers", 0)
-    assert "my-study.html" in run.ok("report", "my-study.zarr").out
-    page = (folder / "my-study.html").read_text(encoding="utf-8")
-    assert "small" in page
-    assert "2 of 2" in page
-    run.refused("report", "my-study.zarr", "my-study.zarr", naming=("my-study.zarr",))
-
-
 pytest.importorskip("hcipy")
-pytest.importorskip("matplotlib")
 
 
 @pytest.fixture(autouse=True)
@@ -195,9 +177,7 @@ def test_options_of_a_night_are_passed_on(run: Commands, monkeypatch: pytest.Mon
     }  # fmt: skip
 
 
-def test_what_magnitude_recommends_is_for_the_configuration(
-    run: Commands, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_magnitude_recommends_for_the_configuration(run: Commands, monkeypatch: pytest.MonkeyPatch) -> None:
     measured: list[Any] = []
     saved: list[Any] = []
 

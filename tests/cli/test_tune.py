@@ -68,9 +68,7 @@ def test_calibration_of_an_existing_configuration_counts_and_stays(run: Commands
     )
 
 
-def test_binned_layout_is_tuned_in_binned_pixels(
-    run: Commands, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_tuning_in_binned_pixels(run: Commands, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     layout = Layout.grid((4, 4), pixels=16, bin=2, frame_shape=(65, 65))
     layout.save("layout.toml")
@@ -147,8 +145,6 @@ def test_tune_learns_psf_from_frames(run: Commands) -> None:
         (("tune", "--recording", "nothere.fits"), ("nothere.fits",)),
     ],
 )
-def test_mistakes_are_named_in_one_line(
-    run: Commands, arguments: tuple[object, ...], naming: tuple[str, ...]
-) -> None:
+def test_mistakes_are_named(run: Commands, arguments: tuple[object, ...], naming: tuple[str, ...]) -> None:
     run.refused(*arguments, naming=naming)  # type: ignore[arg-type]
     assert not Path("faintspot.toml").exists()

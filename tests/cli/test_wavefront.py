@@ -84,14 +84,6 @@ def test_without_scales_it_says_its_unit(run: Commands, slopes: Path) -> None:
     assert "Z7" not in result.out
 
 
-def test_pictures_of_two_recordings_have_two_names(run: Commands, slopes: Path) -> None:
-    for name in ("night.1.npz", "night.2.npz"):
-        slopes.with_name(name).write_bytes(slopes.read_bytes())
-        run.ok("wavefront", name)
-    assert Path("night.1_wavefront.png").exists()
-    assert Path("night.2_wavefront.png").exists()
-
-
 def test_scales_of_the_configuration_are_stored(run: Commands, slopes: Path) -> None:
     scales = "pixel_scale_arcsec = 0.4\nsubaperture_m = 1.0"
     text = CONFIGURATION.replace("[layout.grid]", f"[layout]\n{scales}\n[layout.grid]")
@@ -196,9 +188,7 @@ def test_one_line_names_an_argument_that_cannot_be_used(run: Commands, slopes: P
 
 
 @pytest.mark.parametrize("apart_px", [0.0, 3.44, 11.44])
-def test_layouts_of_their_own_give_the_same_modes(
-    run: Commands, folder: Path, no_picture: None, apart_px: float
-) -> None:
+def test_own_layouts_give_equal_modes(run: Commands, folder: Path, no_picture: None, apart_px: float) -> None:
     """A reference lights more lenslets, whose errors cancel, pitches away over another offset and frame."""
     row, column = np.mgrid[:7, :7].reshape(2, -1)
     at = 8.0 * (column + 1) + 8.0j * (row + 1) + 1j

@@ -74,21 +74,6 @@ def eye_frame(seed: int, n: int = 15) -> Frame:
     return Frame(np.clip(np.round(adu), 0, 255).astype(np.uint8), spots)
 
 
-def narrow_centroid(images: Floats) -> Floats:
-    """Return x, y of the centre of gravity of the 9 x 9 px around the peak of each image, above its rim."""
-    smooth = scipy.ndimage.gaussian_filter(images, (0, 1.5, 1.5))[:, 4:-4, 4:-4]
-    offset = np.arange(-4, 5)
-    found = np.empty((len(images), 2))
-    for i, image in enumerate(images):
-        row, column = np.unravel_index(smooth[i].argmax(), smooth[i].shape)
-        part = image[row : row + 9, column : column + 9]
-        rim = np.concatenate([part[0], part[-1], part[1:-1, 0], part[1:-1, -1]])
-        part = np.maximum(part - np.median(rim), 0.0)
-        total = max(part.sum(), 1e-9)
-        found[i] = column + 4 + (part @ offset).sum() / total, row + 4 + (offset @ part).sum() / total
-    return found
-
-
 @cache
 def mosaic_frames(gains: tuple[float, float, float, float]) -> NDArray[np.uint16]:
     """Return a frame of 9 x 9 spots of FWHM 3.5 px through filters of a Bayer mosaic."""

@@ -115,7 +115,6 @@ def test_one_line_names_what_cannot_be_used(folder: Path, run: Commands) -> None
         "nan": np.full((3, 128, 128), np.nan),
         "even": np.ones((128, 128)),
         "swapped": raw.byteswap(),
-        "wide": raw.view(np.uint8),
     }.items():
         np.save(f"{name}.npy", wrong)
     np.savez("d.npz", other=np.ones((3, 3)))
@@ -125,25 +124,18 @@ def test_one_line_names_what_cannot_be_used(folder: Path, run: Commands) -> None
         "nan.npy": ("nan.npy", "every pixel is NaN"),
         "even.npy": ("even.npy",),
         "swapped.npy": ("swapped.npy", "bytes"),
-        "wide.npy": ("wide.npy", "bytes"),
         "nix.fits": ("nix.fits", "no such file"),
         "a.npy --dark nix.fits": ("nix.fits", "no such file"),
         "a.npy --dark nan": ("dark", "finite"),
         "a.npy --dark d.npz:other": ("dark", "(150, 160)", "(3, 3)"),
         "a.npy --flat flat.npy": ("flat.npy", "above 0"),
-        "a.npy --read-noise-e -1": ("read_noise_e",),
         "a.npy --gain-e-per-adu 0": ("gain_e_per_adu",),
-        "a.npy --gain-e-per-adu nan": ("gain_e_per_adu",),
         "a.npy --diameter-m 0": ("diameter_m = 0",),
-        "a.npy --pixels 1": ("--pixels",),
         "a.npy --pixels 12,14,16": ("--pixels",),
-        "a.npy --pitch-px -1": ("--pitch-px",),
         "a.npy --pitch-px 2": ("--pitch-px",),
         "a.npy --exclude 3,x": ("exclude",),
-        "a.npy --exclude 40-49": ("exclude",),
         "a.npy --exclude 0-48": ("exclude",),
         "a.npy --pupil 1,2": ("pupil",),
-        "a.npy --pupil 80,80,-3": ("pupil",),
         "a.npy --roi 0,0,1000,10": ("roi",),
         "a.npy --illuminated-fraction 2": ("--illuminated-fraction",),
         "a.npy --fit colour": ("--fit", "colour", "centre"),
@@ -362,9 +354,7 @@ def test_a_stated_pitch_keeps_the_defocus_of_the_frame(folder: Path, run: Comman
 
 
 @pytest.mark.usefixtures("only_found")
-def test_what_a_layout_estimated_is_estimated_again_and_what_is_stated_stays(
-    folder: Path, run: Commands
-) -> None:
+def test_what_was_estimated_is_estimated_again_and_what_is_stated_stays(folder: Path, run: Commands) -> None:
     """Dark level and noise, so that slopes have standard errors; the noise stated first, then estimated."""
     arguments = ("layout", "a.npy", "--overwrite", "-o", "new.toml")
     np.save("a.npy", defocused(1.0))

@@ -74,8 +74,6 @@ def test_windows_that_are_smaller_than_the_pitch_are_said(folder: Path, run: Com
         (("--grid", "8x8", "--illuminated-fraction", "2"), "--illuminated-fraction"),
     ],
 )
-def test_grids_that_do_not_fit_are_refused(
-    folder: Path, run: Commands, options: tuple[str, ...], naming: str
-) -> None:
+def test_grids_that_do_not_fit(folder: Path, run: Commands, options: tuple[str, ...], naming: str) -> None:
     save_frames()
     run.refused("layout", "a.npy", *options, "-o", "o.toml", naming=(naming,))

@@ -4,17 +4,13 @@ import secrets
 from collections.abc import Iterator
 from pathlib import Path
 
-import click
 import pytest
-from click.testing import CliRunner
 
 pytest.importorskip("zarr")
 
+from tests.cli.cli_cases import Commands
 from tests.engine.telemetry_cases import LAYOUT, SETTINGS, Engine, as_written
 
-from faintspot.base.errors import InputError
-from faintspot.cli.realtime.control import record
-from faintspot.cli.report import export as export
 from faintspot.engine.segment import FOLDER
 from faintspot.engine.telemetry.ring import TelemetryRing
 from faintspot.io import read_telemetry
@@ -35,38 +31,22 @@ def engine() -> Iterator[Engine]:
         yield running
 
 
-def said(export: click.Command, *arguments: str) -> str:
-    """What a command prints; its errors come through."""
-    return CliRunner().invoke(export, arguments, catch_exceptions=False).output
-
-
-def refused(export: click.Command, *arguments: str) -> str:
-    """The message of an InputError."""
-    error = CliRunner().invoke(export, arguments).exception
-    assert isinstance(error, InputError)
-    return str(error)
-
-
-def test_record_and_export(engine: Engine, tmp_path: Path) -> None:
+def test_record_and_export(engine: Engine, tmp_path: Path, run: Commands) -> None:
     aotpy = pytest.importorskip("aotpy")
-    name, store, file = engine.ring.name, tmp_path / "night.zarr", tmp_path / "night.fits"
-    text = said(record, str(store), "--name", name, "--frames", "50")
+    store, file = tmp_path / "night.zarr", tmp_path / "night.fits"
+    text = run.ok("realtime", "record", store, "--name", engine.ring.name, "--frames", 50).out
     assert f"{store}: 50 frames in " in text
     assert "(all that were asked for); nothing dropped" in text
     telemetry = read_telemetry(store)
     assert as_written(vars(telemetry))
-    images = len(telemetry.image_frame)
-    assert f"{file}: 50 frames, {images} images" in said(
-        export, str(store), "-o", str(file), "--ao-mode", "GLAO"
-    )
+    text = run.ok("export", store, "-o", file, "--ao-mode", "GLAO").out
+    assert f"{file}: 50 frames, {len(telemetry.image_frame)} images" in text
     assert aotpy.AOSystem.read_from_file(file).ao_mode == "GLAO"
 
 
-def test_what_cannot_be_done_is_said(engine: Engine, tmp_path: Path) -> None:
-    name = engine.ring.name
-    assert "ends in .zarr" in refused(record, str(tmp_path / "night"), "--name", name)
-    assert "start the engine first" in refused(
-        record, str(tmp_path / "night.zarr"), "--name", f"{name}-other"
-    )
-    assert "ends in .fits" in refused(export, str(tmp_path / "a.zarr"), "-o", str(tmp_path / "b"))
-    assert "no such file" in refused(export, str(tmp_path / "a.zarr"))
+def test_what_cannot_be_done_is_said(engine: Engine, tmp_path: Path, run: Commands) -> None:
+    name, store = engine.ring.name, tmp_path / "a.zarr"
+    run.refused("realtime", "record", tmp_path / "night", "--name", name, naming=("ends in .zarr",))
+    run.refused("realtime", "record", store, "--name", f"{name}-other", naming=("start the engine first",))
+    run.refused("export", store, "-o", tmp_path / "b", naming=("ends in .fits",))
+    run.refused("export", store, naming=("no such file",))

@@ -13,11 +13,14 @@ from faintspot.slopes.simulate import Detector
 SHAPE = (64, 64)
 
 
-def measured(detector: Detector, n: int) -> DarkPixels:
-    darks = detector.expose(np.zeros((n, *SHAPE)), np.random.default_rng(2))
+def pixels_of(darks: NDArray[Any]) -> DarkPixels:
     pixels = fs.measure_detector(darks=darks).pixels
     assert pixels is not None
     return pixels
+
+
+def measured(detector: Detector, n: int, shape: tuple[int, int] = SHAPE) -> DarkPixels:
+    return pixels_of(detector.expose(np.zeros((n, *shape)), np.random.default_rng(2)))
 
 
 def logarithmic_error(found: NDArray[Any], true: Any) -> float:
@@ -69,17 +72,12 @@ class TestBlinking:
 
     def test_noisy_pixels_do_not_blink(self) -> None:
         detector = Detector.cmos((200, 200), 1.0, spread=1.0, rng=np.random.default_rng(5))
-        darks = detector.expose(np.zeros((60, 200, 200)), np.random.default_rng(6))
-        pixels = fs.measure_detector(darks=darks).pixels
-        assert pixels is not None
-        assert not len(pixels.blinking)
+        assert not len(measured(detector, 60, (200, 200)).blinking)
 
     def test_one_cosmic_ray_is_no_level(self) -> None:
         darks = np.random.default_rng(7).normal(0.0, 1.0, (40, *SHAPE))
         darks[11, 3, 4] += 500.0
-        pixels = fs.measure_detector(darks=darks).pixels
-        assert pixels is not None
-        assert not len(pixels.blinking)
+        assert not len(pixels_of(darks).blinking)
 
     def test_what_two_levels_leave(self) -> None:
         """Nothing of two levels without noise, and 1 - 2 / pi of many normal values."""

@@ -18,10 +18,9 @@ STANDARD_ERRORS = 4.9  # Gaussian, two-sided: 1e-6
 SHAPE = (400, 500)
 
 
-def check_mean_and_variance(detector: Detector, level: float, seed: int = 1) -> None:
-    """Compare 200,000 pixels with the mean and the variance that the detector states."""
+def check_mean_and_variance(detector: Detector, level: float) -> None:
     mean_e = np.full(SHAPE, level)
-    electrons = detector.to_electrons(detector.expose(mean_e, np.random.default_rng(seed))).astype(np.float64)
+    electrons = detector.to_electrons(detector.expose(mean_e, np.random.default_rng(1))).astype(np.float64)
     expected = level + float(np.mean(detector.dark_e)) + float(np.mean(detector.background_e))
     variance = float(np.mean(detector.variance(mean_e)))
     n = electrons.size
@@ -37,22 +36,12 @@ def check_mean_and_variance(detector: Detector, level: float, seed: int = 1) -> 
 @pytest.mark.parametrize("em_gain", [1.0, 500.0])
 @pytest.mark.parametrize("level", [0.0, 0.2, 25.0])
 def test_mean_and_variance(read_noise_e: float, em_gain: float, level: float) -> None:
-    detector = Detector(read_noise_e, em_gain=em_gain, dark_e=0.3, background_e=0.4)
-    check_mean_and_variance(detector, level)
-
-
-@pytest.mark.parametrize("em_gain", [1.0, 500.0])
-@pytest.mark.parametrize("gain_e_per_adu", [0.7, 5.0])
-def test_mean_and_variance_quantised(em_gain: float, gain_e_per_adu: float) -> None:
-    # Read noise of at least 0.6 ADU, where the rounding error is uniform to 1e-3 of itself.
-    detector = Detector(3.0, em_gain=em_gain, gain_e_per_adu=gain_e_per_adu, offset_adu=100, bits=20)
-    check_mean_and_variance(detector, 12.0)
-
-
-def test_excess_noise_factor() -> None:
-    assert Detector().excess_noise_factor == 1.0
-    assert Detector(em_gain=200).excess_noise_factor == 2.0
-    assert Detector(0.0, em_gain=200).variance([[7.0]])[0, 0] == 14.0
+    """Compare 200,000 pixels with the mean and the variance that the detector states."""
+    check_mean_and_variance(Detector(read_noise_e, em_gain=em_gain, dark_e=0.3, background_e=0.4), level)
+    if read_noise_e == 3.0:  # at least 0.6 ADU, where the rounding error is uniform to 1e-3 of itself
+        for gain in (0.7, 5.0):
+            quantised = Detector(3.0, em_gain=em_gain, gain_e_per_adu=gain, offset_adu=100, bits=20)
+            check_mean_and_variance(quantised, level + 1.0)
 
 
 def test_register_output_of_one_electron_is_exponential() -> None:

@@ -32,9 +32,7 @@ def recorded(
 
 @pytest.mark.parametrize("movement_px", [0.0, 0.05])
 @pytest.mark.parametrize(("detector", "flux_e"), [(CAMERA, 5000.0), (MULTIPLYING, 300.0)])
-def test_darks_and_frames_give_back_the_detector(
-    detector: Detector, flux_e: float, movement_px: float
-) -> None:
+def test_darks_and_frames_give_the_detector(detector: Detector, flux_e: float, movement_px: float) -> None:
     frames, darks = recorded(detector, flux_e, movement_px=movement_px)
     found = measure_detector(frames, darks, layout=LAYOUT, em_gain=detector.em_gain)
     assert found.reliable, found.notes

@@ -161,9 +161,7 @@ def hits(compiled: Any) -> int:
     return sum(compiled.stats.cache_hits.values())
 
 
-def test_kept_for_each_kind_of_argument_in_a_file_of_its_own(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_each_kind_of_argument_has_a_file_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     first, second = dispatcher(tmp_path, monkeypatch), dispatcher(tmp_path, monkeypatch)
     # As two processes do: both have read the index before either writes it.
     monkeypatch.setattr(first._cache._cache_file, "_load_index", dict)
@@ -199,9 +197,7 @@ def test_a_folder_that_goes_away(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 
 
 @pytest.mark.parametrize("ending", ["nbi", "nbc"])
-def test_damaged_files_are_compiled_anew(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ending: str
-) -> None:
+def test_damaged_files_are_made_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ending: str) -> None:
     assert dispatcher(tmp_path, monkeypatch)(1) == 2
     (damaged,) = tmp_path.rglob(f"*.{ending}")
     damaged.write_bytes(b"\x80\x04garbage")

@@ -13,15 +13,10 @@ from faintspot.slopes.spots.shapes import spots
 N = 60
 
 
-def frames(flux_e: float, read_noise_e: float, side: int, seed: int) -> tuple[NDArray[np.float32], fs.Layout]:
-    """Three frames of stacked windows; spots of FWHM 3.6 px within 1.5 px."""
-    images, _ = simulated(flux_e, read_noise_e, side, seed)
-    return images, fs.Layout.stacked(N, (side, side))
-
-
 def simulated(
     flux_e: float, read_noise_e: float, side: int, seed: int
 ) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
+    """Three frames of stacked windows; spots of FWHM 3.6 px within 1.5 px."""
     images, positions = fs.slopes.simulate.subapertures(
         3 * N,
         shape=(side, side),
@@ -47,7 +42,8 @@ def error(
 def test_not_worse_than_a_fixed_window_or_the_reference(flux_e: float, read_noise_e: float) -> None:
     """At most 5 % worse, which is three standard errors of 360 slopes that share their images."""
     side = 27
-    shown, layout = frames(flux_e, read_noise_e, side, 1)
+    shown, _ = simulated(flux_e, read_noise_e, side, 1)
+    layout = fs.Layout.stacked(N, (side, side))
     found = first_settings(layout, fs.Calibration(dark=0.0), shown)
     assert found.noise == pytest.approx(read_noise_e, rel=0.15)
     assert (found.response < 1) == (flux_e <= 40)

@@ -35,9 +35,8 @@ def record(made: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     return made
 
 
-def test_the_command_follows(record: Recording, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_follows(record: Recording, run: Commands) -> None:
     pytest.importorskip("zarr")
-    run = Commands(capsys)
     run.ok("slopes", "frames.npy", "-o", "s.zarr", "--follow")
     stored, expected = read_slopes("s.zarr"), fs.SpotFollower(record.pipeline())(record.frames)
     assert stored.attributes["followed"]
@@ -81,8 +80,7 @@ def test_the_report_has_the_paths(record: Recording) -> None:
     assert "Not drawn: " in Page(report_of_stored(["s.npz"])).text
 
 
-def test_what_is_refused(record: Recording, capsys: pytest.CaptureFixture[str]) -> None:
-    run = Commands(capsys)
+def test_what_is_refused(record: Recording, run: Commands) -> None:
     run.refused("slopes", "frames.npy", "--follow", "--mean-flux", naming=("--follow", "--mean-flux"))
     Path("faintspot.toml").write_text(Path("faintspot.toml").read_text().replace("pitch_px", "# pitch_px"))
     run.refused("slopes", "frames.npy", "--follow", naming=("faintspot.toml", "pitch_px"))

@@ -39,11 +39,6 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.fixture
-def run(capsys: pytest.CaptureFixture[str]) -> Commands:
-    return Commands(capsys)
-
-
 def calibration() -> fs.Calibration:
     return fs.Calibration(DARK_ADU, read_noise_e=1.0, bad_pixels=np.array([[14, 25]]))
 

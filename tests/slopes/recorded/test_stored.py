@@ -161,9 +161,7 @@ def measured(folder: Path, name: str, **options: Any) -> Path:
 @pytest.mark.parametrize(
     ("name", "options"), [("brightest", {}), ("thresholded", {"threshold_e": 0.5}), ("ml", {})]
 )
-def test_the_page_of_an_estimator_speaks_of_it_alone(
-    tmp_path: Path, name: str, options: dict[str, Any]
-) -> None:
+def test_page_of_an_estimator_speaks_of_it_alone(tmp_path: Path, name: str, options: dict[str, Any]) -> None:
     text = Page(report_of_stored([measured(tmp_path, name, **options)])).text
     estimator = Settings(estimator=name, **options).estimator
     assert f"Settings {estimator.in_words(9, 64)}" in text

@@ -23,10 +23,8 @@ class Comatic:
     spots: NDArray[np.complex128]
 
 
-def comatic(
-    coma: float, *, geometry: str = "square", seed: int = 0, pitch_px: float = 20.0, lenslets: int = 12
-) -> Comatic:
-    rng = np.random.default_rng(seed)
+def comatic(coma: float, *, geometry: str = "square", seed: int = 0) -> Comatic:
+    rng, pitch_px, lenslets = np.random.default_rng(seed), 20.0, 12
     size = int((lenslets + 3) * pitch_px)
     count = np.arange(-2 * lenslets, 2 * lenslets + 1)
     cells = (count + count[:, None] * RATIOS[geometry]).ravel() + complex(*rng.uniform(-0.5, 0.5, 2))

@@ -36,9 +36,7 @@ def nodes(geometry: str, across: int, pitch_px: float, angle_deg: float = 4.0) -
     [(30, 5.2, 0.15), (12, 8.0, 0.2), (4, 100.0, 0.02), (4, 60.0, 0.2), (5, 33.0, 0.05)],
     ids=["dense", "wide", "far and sharp", "far and wide", "few"],
 )
-def test_pitch_and_width_of_spots_of_any_ratio(
-    geometry: str, across: int, pitch_px: float, width: float
-) -> None:
+def test_pitch_and_width_of_any_ratio(geometry: str, across: int, pitch_px: float, width: float) -> None:
     at = nodes(geometry, across, pitch_px)
     size = int((across + 2) * pitch_px)
     width_px = max(width * pitch_px, 0.7)

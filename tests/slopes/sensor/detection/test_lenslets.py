@@ -228,9 +228,7 @@ def test_reference_frame_is_illuminated_all_over() -> None:
 @pytest.mark.parametrize(
     ("width_px", "photons", "seed"), [(0.5, 8, 2), (0.6, 15, 3), (0.8, 8, 2), (0.7, 60, 1)]
 )
-def test_sharp_spots_over_a_clipped_background_are_no_hot_pixels(
-    width_px: float, photons: float, seed: int
-) -> None:
+def test_sharp_spots_on_a_clipped_background_are_not_hot(width_px: float, photons: float, seed: int) -> None:
     """Half of them look like hot pixels: most neighbours are 0. 30 real ones are as bright as spots."""
     rng = np.random.default_rng(seed)
     side, pitch = 258, 17.0
