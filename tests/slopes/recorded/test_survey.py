@@ -42,7 +42,7 @@ SIDE, N, FRAMES, FLUX_E = 12, 4, 1500, 40.0
 def movie(shift_px: float) -> np.ndarray:
     """Speckled spots that move by 1 px rms, without noise, all displaced by the shift along x."""
     moved = np.random.default_rng(1).normal([shift_px, 0.0], 1.0, (FRAMES * N, 2))
-    images, _ = speckled_images(
+    images = speckled_images(
         moved, d_over_r0=2.0, shape=(SIDE, SIDE), size=1.0, flux_e=FLUX_E, rng=np.random.default_rng(2)
     )
     return images.reshape(FRAMES, N * SIDE, SIDE).astype(np.float32)

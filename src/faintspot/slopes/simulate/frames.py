@@ -7,13 +7,13 @@ from typing import Any, Unpack
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from faintspot.base.checks import finite_array, number_between, spawn
+from faintspot.base.checks import number_between, spawn
 from faintspot.base.errors import InputError
 from faintspot.slopes.camera.detector import Detector
 from faintspot.slopes.sensor.layout import Layout
 from faintspot.slopes.spots.psf import PSF
 from faintspot.slopes.spots.shapes import SpotShape, image_shape, per_spot, spots
-from faintspot.slopes.spots.speckled import LARGEST_D_OVER_R0, speckled_images
+from faintspot.slopes.spots.speckled import LARGEST_D_OVER_R0, speckled_images, true_positions
 
 _Images = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 
@@ -91,7 +91,7 @@ def subapertures(
     position_rng, noise_rng = spawn(rng, 2)
     # Spawned only if needed, so that without turbulence later draws of the generator do not change.
     phase_rng = spawn(rng, 1)[0] if turbulence else None
-    truth = _true_positions(positions, position_range_px, (n, 2), position_rng)
+    truth = true_positions(positions, position_range_px, (n, 2), position_rng)
     camera = _camera(detector)
     profile, spot = _values_of_spots(n, (ny, nx), flux_e, **spot_shape)
     if turbulence and (profile != "diffraction" or np.any(spot["elongation"] != 1)):
@@ -104,7 +104,7 @@ def subapertures(
         if phase_rng is None:
             mean_e = spots(truth[part], shape=(ny, nx), profile=profile, **shapes)
         else:
-            mean_e, _ = speckled_images(
+            mean_e = speckled_images(
                 truth[part],
                 d_over_r0=turbulence,
                 shape=(ny, nx),
@@ -182,7 +182,7 @@ def sensor_frames(
     n_frames = int(number_between("n_frames", n_frames, 1, integer=True))
     n, pixels = len(layout), _window_pixels(layout)
     position_rng, noise_rng = spawn(rng, 2)
-    truth = _true_positions(positions, position_range_px, (n_frames, n, 2), position_rng)
+    truth = true_positions(positions, position_range_px, (n_frames, n, 2), position_rng)
     jitter = number_between("jitter_px", jitter_px, 0.0)
     if jitter:  # spawned only if needed, as above
         truth += spawn(rng, 1)[0].normal(0.0, jitter, (n_frames, 1, 2))
@@ -248,19 +248,6 @@ def _camera(detector: object) -> Detector:
     if not isinstance(detector, Detector):
         raise InputError(f"detector: expected a Detector or None, got {type(detector).__name__}")
     return detector
-
-
-def _true_positions(
-    positions: object, position_range_px: float, shape: tuple[int, ...], rng: np.random.Generator
-) -> NDArray[np.float64]:
-    """Return the given positions, or uniform random ones, with shape (..., n, 2)."""
-    half = number_between("position_range_px", position_range_px, 0)
-    if positions is None:
-        return rng.uniform(-half, half, shape)
-    given = finite_array("positions", positions).astype(np.float64)
-    if given.shape not in (shape, shape[-2:]):
-        raise InputError(f"positions: expected shape {shape[-2:]} or {shape}, got {given.shape}")
-    return np.broadcast_to(given, shape).copy()
 
 
 def _window_pixels(layout: Layout) -> NDArray[np.int64]:

@@ -7,7 +7,7 @@ from typing import NamedTuple, Required, TypedDict, Unpack
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from faintspot.base.checks import finite_array, number_between, numbers_between, one_of, spawn
+from faintspot.base.checks import finite_array, number_between, numbers_between, spawn
 from faintspot.base.errors import InputError
 from faintspot.slopes.spots.shapes import SMALLEST_SIZE, image_shape, per_spot, structure_function
 
@@ -18,8 +18,6 @@ LARGEST_D_OVER_R0 = 10.0
 
 # Points across the sub-aperture. The image of the grid is periodic with a period of `points` lambda / d.
 _FEWEST_POINTS, _MOST_POINTS = 24, 40
-_LARGEST_OUTER_SCALE = 1e5
-_TRUTHS = ("gradient", "centre_of_gravity")
 _BLOCK_POINTS = 1 << 18  # image samples processed at a time: the temporary arrays stay in the cache
 
 
@@ -35,10 +33,6 @@ class Speckles(TypedDict, total=False):
     the flux is in the outer parts."""
     flux_e: ArrayLike
     """Electrons in the whole, infinite spot, as in `faintspot.slopes.spots.shapes` [default: 1]."""
-    outer_scale_d: float | None
-    """Outer scale in units of the sub-aperture's side d, 0.1 to 1e5 [default: infinite (Kolmogorov)]."""
-    natural_tilt: bool
-    """Whether the mean gradient of the turbulence itself is kept and added to the position."""
 
 
 class _PhaseModes(NamedTuple):
@@ -53,19 +47,20 @@ def speckled_spots(
     *,
     position_range_px: float = 1.0,
     positions: ArrayLike | None = None,
-    truth: str = "gradient",
     rng: np.random.Generator | None = None,
     **speckles: Unpack[Speckles],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return noiseless short-exposure images behind square sub-apertures, and the positions of their spots.
 
     The phase of each image is drawn from its exact covariance over the sub-aperture, that of the Kolmogorov
-    structure function 6.88 (r / r0)^(5/3) (Fried 1966, JOSA 56, 1372) or, with an outer scale, of von
-    Karman turbulence. The amplitude is uniform (no scintillation). With d_over_r0 = 0 the images are the
-    "diffraction" spots of `faintspot.slopes.spots.shapes`.
+    structure function 6.88 (r / r0)^(5/3) (Fried 1966, JOSA 56, 1372). The amplitude is uniform (no
+    scintillation). With d_over_r0 = 0 the images are the "diffraction" spots of
+    `faintspot.slopes.spots.shapes`.
 
-    By default, the mean gradient of the turbulent phase is replaced by the random (or given) position, so
-    that positions have the requested range at any strength of turbulence.
+    The mean gradient of the turbulent phase is replaced by the random (or given) position, so that positions
+    have the requested range at any strength of turbulence. A position is the mean gradient of the phase over
+    the sub-aperture as a displacement of the spot: the quantity that a wavefront sensor is to measure, and
+    the centre of gravity of all flux in and outside the image.
 
     Parameters
     ----------
@@ -75,11 +70,6 @@ def speckled_spots(
         Positions are uniform within plus and minus this, on each axis, px.
     positions : array_like, shape (n, 2), optional
         x and y in px, instead of random ones.
-    truth : {"gradient", "centre_of_gravity"}
-        "gradient": mean gradient of the phase over the sub-aperture as a displacement of the spot. This is
-        the quantity that a wavefront sensor is to measure, and the centre of gravity of all flux in and
-        outside the image. "centre_of_gravity": centre of gravity of the flux within the image, without
-        noise.
     rng : numpy.random.Generator, optional
         Generator from which separate ones for positions and phases are spawned.
     **speckles
@@ -108,17 +98,22 @@ def speckled_spots(
     0.5
     """
     n = int(number_between("n", n, 1, integer=True))
-    kind_of_truth = one_of("truth", truth, _TRUTHS)
     position_rng, phase_rng = spawn(rng, 2)
+    true = true_positions(positions, position_range_px, (n, 2), position_rng)
+    return speckled_images(true, rng=phase_rng, **speckles), true
+
+
+def true_positions(
+    positions: object, position_range_px: float, shape: tuple[int, ...], rng: np.random.Generator
+) -> Floats:
+    """Return the given positions, or uniform random ones, with shape (..., n, 2)."""
     half = number_between("position_range_px", position_range_px, 0)
     if positions is None:
-        points = position_rng.uniform(-half, half, (n, 2))
-    else:
-        points = finite_array("positions", positions).astype(np.float64)
-        if points.shape != (n, 2):
-            raise InputError(f"positions: expected shape ({n}, 2), got {points.shape}")
-    images, gradients = speckled_images(points, rng=phase_rng, **speckles)
-    return images, gradients if kind_of_truth == "gradient" else _centres_of_gravity(images)
+        return rng.uniform(-half, half, shape)
+    given = finite_array("positions", positions).astype(np.float64)
+    if given.shape not in (shape, shape[-2:]):
+        raise InputError(f"positions: expected shape {shape[-2:]} or {shape}, got {given.shape}")
+    return np.broadcast_to(given, shape).copy()
 
 
 def speckled_images(
@@ -128,45 +123,28 @@ def speckled_images(
     shape: tuple[int, int] = (16, 16),
     size: ArrayLike = 1.0,
     flux_e: ArrayLike = 1.0,
-    outer_scale_d: float | None = None,
-    natural_tilt: bool = False,
     rng: np.random.Generator,
-) -> tuple[Floats, Floats]:
-    """Return images and the displacements by the mean gradients; see `speckled_spots`.
+) -> Floats:
+    """Return images of spots at positions (n, 2); see `speckled_spots`.
 
     The phases are the next draws of `rng`, so that several calls give the same images as one call.
     """
     n = len(positions)
     ny, nx = image_shape("shape", shape)
-    strength = _per_image_d_over_r0(d_over_r0, n) ** (5 / 6)
+    checked = numbers_between("d_over_r0", d_over_r0, 0.0, LARGEST_D_OVER_R0)
+    strength = per_spot("d_over_r0", checked, n) ** (5 / 6)
     width = 2.0 * per_spot("size", size, n, SMALLEST_SIZE)
     flux = per_spot("flux_e", flux_e, n, 0.0)
-    scale = _outer_scale(outer_scale_d)
     points = _points(max(ny, nx) / float(np.min(width)), float(np.max(strength)) ** (6 / 5))
-    modes = _phase_modes(points, scale)
+    modes = _phase_modes(points)
     nodes, weights = _pixel_samples(float(np.min(width)))
     images = np.empty((n, ny, nx))
-    displaced = positions.copy()
     block = max(1, _BLOCK_POINTS // (ny * nx * len(nodes) ** 2))
     for start in range(0, n, block):
         part = slice(start, start + block)
-        phase, gradient = _draw(modes, strength[part], rng)
-        if natural_tilt:
-            displaced[part] += gradient * (width[part, None] / (2 * np.pi))
-        images[part] = _intensities(phase, displaced[part], width[part], (ny, nx), nodes, weights)
-    return images * flux[:, None, None], displaced
-
-
-def _per_image_d_over_r0(value: object, n: int) -> Floats:
-    checked = numbers_between("d_over_r0", value, 0.0, LARGEST_D_OVER_R0)
-    return per_spot("d_over_r0", checked, n, 0.0)
-
-
-def _outer_scale(value: object) -> float:
-    """Return the outer scale in units of d, or infinity."""
-    if value is None:
-        return math.inf
-    return number_between("outer_scale_d", value, 0.1, _LARGEST_OUTER_SCALE)
+        phase, _ = _draw(modes, strength[part], rng)
+        images[part] = _intensities(phase, positions[part], width[part], (ny, nx), nodes, weights)
+    return images * flux[:, None, None]
 
 
 def _points(window_lambda_over_d: float, d_over_r0: float) -> int:
@@ -176,7 +154,7 @@ def _points(window_lambda_over_d: float, d_over_r0: float) -> int:
 
 
 @functools.lru_cache(maxsize=8)
-def _phase_modes(points: int, outer_scale: float) -> _PhaseModes:
+def _phase_modes(points: int) -> _PhaseModes:
     """Return the square root of the covariance of phases and mean gradients, for d = r0 = 1.
 
     The mean gradient of a phase over a square is exactly the difference of its means over opposite edges,
@@ -189,7 +167,7 @@ def _phase_modes(points: int, outer_scale: float) -> _PhaseModes:
     y = np.concatenate([y, line, line, half, -half])
     n = points**2
     distance = np.hypot(x[:, None] - x, y[:, None] - y)
-    structure = structure_function(distance, outer_scale)
+    structure = structure_function(distance, math.inf)
     from_piston = structure[:n].mean(axis=0)
     covariance = 0.5 * (from_piston[:, None] + from_piston - structure - from_piston[:n].mean())
     edges = np.repeat([[1.0, -1.0, 0, 0], [0, 0, 1, -1]], points, axis=1) / points
@@ -262,13 +240,3 @@ def _fourier(length: int, centre: Floats, width: Floats, points: int, nodes: Flo
     wave = np.exp(((-2j * np.pi) * (angle[:, :, None] * line)).astype(np.complex64))
     transform: NDArray[np.complex64] = wave * square[:, :, None].astype(np.float32)
     return transform
-
-
-def _centres_of_gravity(images: Floats) -> Floats:
-    """Return the centre of gravity of each image, px from its centre."""
-    ny, nx = images.shape[1:]
-    total = images.sum(axis=(1, 2))
-    x = images.sum(axis=1) @ (np.arange(nx) - (nx - 1) / 2)
-    y = images.sum(axis=2) @ (np.arange(ny) - (ny - 1) / 2)
-    centres: Floats = np.stack([x, y], axis=1) / np.where(total > 0, total, 1.0)[:, None]
-    return centres
