@@ -1,12 +1,12 @@
 """Cramer-Rao bound on the position of a spot, and the photon efficiency of estimators.
 
 The bound holds for unbiased estimators. An estimator that knows that positions lie within some range can have
-a smaller error at low flux; see `prior_std_px`.
+a smaller error at low flux.
 """
 
 import functools
 import math
-from typing import Any, NamedTuple, Protocol, Unpack
+from typing import Any, NamedTuple, Unpack
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -88,13 +88,6 @@ _BRACKET = 1e12  # largest and, inverted, smallest flux tried by photon_efficien
 _FLUX_STEPS_PER_DECADE = 12
 
 
-class SpotImages(Protocol):
-    """Object that provides noiseless spot images at given positions, such as `faintspot.PSF`."""
-
-    def images(self, positions: Any, shape: tuple[int, int], flux_e: Any = 1.0) -> Floats:
-        """Return images (n, ny, nx) of spots at positions (n, 2)."""
-
-
 class _Spot(NamedTuple):
     """Images of a spot with 1 e- in its window when centred, and their derivatives: (m, pixels)."""
 
@@ -116,13 +109,11 @@ def cramer_rao(
     flux_e: ArrayLike,
     *,
     shape: tuple[int, int] = (16, 16),
-    psf: SpotImages | None = None,
+    psf: PSF | None = None,
     detector: Detector | None = None,
     positions: ArrayLike = (0.0, 0.0),
     position_range_px: float | None = None,
-    unknown_flux: bool = True,
     unknown_background: bool = False,
-    prior_std_px: float | None = None,
     noise: str = "exact",
     **spot_shape: Unpack[SpotShape],
 ) -> NDArray[np.float64]:
@@ -138,10 +129,10 @@ def cramer_rao(
         Electrons within the image of a centred spot, as in `faintspot.slopes.simulate.subapertures`; above 0.
     shape : (int, int)
         Rows and columns (ny, nx) of the image, at least 3 px each.
-    psf : object with a method ``images(positions, shape, flux_e)``, optional
-        PSF of the spot, such as a `faintspot.PSF`, instead of a shape. Pixels in which it is not positive
-        are ignored. Noise in the wings of a learnt PSF increases the apparent information if the read noise
-        is low.
+    psf : PSF, optional
+        PSF of the spot instead of a shape; of several, the first. Pixels in which it is not positive are
+        ignored. Noise in the wings of a learnt PSF increases the apparent information if the read noise is
+        low.
     detector : Detector, optional
         Detector that defines the noise; mean background and dark current are known unless
         `unknown_background`. Quantisation counts as read noise of 1/12 ADU squared; full well and
@@ -150,13 +141,8 @@ def cramer_rao(
         x and y [px]; the result is the mean over the positions.
     position_range_px : float, optional
         Use positions uniform within plus and minus this on each axis, instead of `positions`.
-    unknown_flux, unknown_background : bool
-        Whether they are estimated along with the position.
-    prior_std_px : float, optional
-        Standard deviation of the prior of an estimator: a normal distribution around the true position.
-        Adds 1 / prior_std_px^2 to the information on x and y (van Trees 1968), so that the result never
-        exceeds it. Positions uniform within +-a have a standard deviation a / sqrt(3). The bound is then
-        only a guide, since that distribution has edges (without flux, R is a / 2, not 0.46 a).
+    unknown_background : bool
+        Whether it is estimated along with position and flux.
     noise : {"exact", "gaussian"}
         "exact": information of Poisson electrons plus Gaussian read noise, summed over the number of
         electrons. "gaussian": sum over pixels of (dm/dx)^2 / variance, which is lower at low flux and equal
@@ -188,9 +174,6 @@ def cramer_rao(
     if min(ny, nx) < 3:
         raise InputError(f"shape: expected at least 3 rows and columns, got ({ny}, {nx})")
     exact = one_of("noise", noise, _NOISES) == "exact"
-    prior = math.inf
-    if prior_std_px is not None:
-        prior = number_between("prior_std_px", prior_std_px, 0.0, low_open=True)
     points = _positions(positions, position_range_px)
     if psf is None:
         render = functools.partial(spots, shape=(ny, nx), **spot_shape)
@@ -204,7 +187,7 @@ def cramer_rao(
     blur = _noise(detector, (ny, nx), exact)
     bound = np.empty((*flux.shape, 2))
     for index in np.ndindex(flux.shape):
-        covariances = _covariances(float(flux[index]), spot, blur, unknown_flux, unknown_background, prior)
+        covariances = _covariances(float(flux[index]), spot, blur, unknown_background)
         bound[index] = np.sqrt(np.diagonal(covariances, axis1=1, axis2=2)).mean(axis=0)
     return bound
 
@@ -260,7 +243,7 @@ def cramer_rao_covariance(
     for plane in range(count):
         render = functools.partial(psf.images, shape=size, which=plane)
         spot = _with_derivatives(render, np.zeros((1, 2)), STEP_PX)
-        bound[plane] = _covariances(float(flux[plane]), spot, blur, True, False, math.inf)[0]
+        bound[plane] = _covariances(float(flux[plane]), spot, blur)[0]
     return bound
 
 
@@ -268,7 +251,7 @@ def photon_efficiency(error_px: ArrayLike, flux_e: ArrayLike, **conditions: Any)
     """Return the fraction of its flux that an estimator would need if it reached the Cramer-Rao bound.
 
     This is (flux at which the slope error R of the bound equals that of the estimator) / (flux used). The
-    limit is 1; a larger value means a bias towards the truth, for example by a prior.
+    limit is 1; a larger value means a bias towards the truth, for example by a prior of the estimator.
 
     Parameters
     ----------
@@ -278,8 +261,7 @@ def photon_efficiency(error_px: ArrayLike, flux_e: ArrayLike, **conditions: Any)
     flux_e : float or array_like
         Electrons used, defined as in `cramer_rao`; broadcast with `error_px`.
     **conditions
-        Spot, detector, positions and unknowns, as for `cramer_rao`. With `prior_std_px`, errors that the
-        prior alone achieves have efficiency 0.
+        Spot, detector, positions and unknowns, as for `cramer_rao`.
 
     Returns
     -------
@@ -314,19 +296,18 @@ def photon_efficiency(error_px: ArrayLike, flux_e: ArrayLike, **conditions: Any)
     steps = 3 + math.ceil(_FLUX_STEPS_PER_DECADE * math.log10(high / low))
     grid = np.geomspace(low, high, steps)
     bounds = slope_error(grid)
-    # With a prior, the bound is constant up to some flux: the curve starts at the last such point.
-    first = int(np.argmax(bounds < bounds[0] * (1 - 1e-9))) - 1
-    inverse = PchipInterpolator(-np.log(bounds[first:]), np.log(grid[first:]))
-    needed = np.where(error >= bounds[0], 0.0, np.exp(inverse(-np.log(np.minimum(error, bounds[0])))))
-    efficiency: Floats = needed / used
+    inverse = PchipInterpolator(-np.log(bounds), np.log(grid))
+    efficiency: Floats = np.exp(inverse(-np.log(error))) / used
     return efficiency
 
 
 def _bracket(slope_error: Any, smallest: float, largest: float, start: float) -> tuple[float, float]:
-    """Return two fluxes with slope errors above `largest` (if the prior permits) and below `smallest`."""
+    """Return two fluxes with slope errors above `largest` and below `smallest`."""
     low = high = start
-    while slope_error(np.array(low)) < 1.01 * largest and low > 1 / _BRACKET:
+    while slope_error(np.array(low)) < 1.01 * largest:
         low /= 10
+        if low < 1 / _BRACKET:
+            raise InputError(f"error_px = {largest:g}: expected an error below that of {1 / _BRACKET:g} e-")
     while slope_error(np.array(high)) > 0.99 * smallest:
         high *= 10
         if high > _BRACKET:
@@ -373,23 +354,18 @@ def _noise(detector: object, shape: tuple[int, int], exact: bool) -> _PixelNoise
     return _PixelNoise(read_noise.ravel(), background.ravel(), excess, exact and excess == 1)
 
 
-def _covariances(
-    flux: float, spot: _Spot, noise: _PixelNoise, unknown_flux: bool, unknown_background: bool, prior: float
-) -> Floats:
+def _covariances(flux: float, spot: _Spot, noise: _PixelNoise, unknown_background: bool = False) -> Floats:
     """Return the bound on the covariance of x and y at each position, (m, 2, 2)."""
     weight = _pixel_information(flux * spot.image + noise.background_e, noise)
-    derivatives = [flux * spot.along_x, flux * spot.along_y]
-    if unknown_flux:
-        derivatives.append(spot.image)
+    derivatives = [flux * spot.along_x, flux * spot.along_y, spot.image]
     if unknown_background:
         derivatives.append(np.ones_like(spot.image))
     stack = np.stack(derivatives, axis=1)
     information = np.einsum("map,mbp,mp->mab", stack, stack, weight, optimize=True)
-    information[:, [0, 1], [0, 1]] += 1 / prior**2
     # In units of the error of each unknown, the matrix is well conditioned at any flux.
     scale = np.sqrt(np.diagonal(information, axis1=1, axis2=2))
     illuminated = np.all(scale > 0, axis=1)
-    covariances = np.full((len(scale), 2, 2), np.diag([prior**2, prior**2]))
+    covariances = np.full((len(scale), 2, 2), np.diag([math.inf, math.inf]))
     if illuminated.any():
         scale = scale[illuminated]
         inverse = np.linalg.inv(information[illuminated] / (scale[:, :, None] * scale[:, None, :]))
