@@ -124,7 +124,7 @@ def largest_value(case: Case) -> NDArray[np.float64]:
 def strengths_of(case: Case) -> NDArray[np.float64]:
     """Strength of the denoising of every sub-aperture; 0 where there is none."""
     n = len(case.layout)
-    if not case.settings.estimator.denoises:
+    if not case.settings.estimator.without_denoising():
         return np.zeros(n)
     return case.settings.values("noise_std", n, case.layout.pixels)
 

@@ -51,7 +51,7 @@ class TestAgainstOracle:
         assert np.array_equal(stages.raw, case.layout.images(case.frame), equal_nan=True)
         for s in range(n):
             denoised = stages.calibrated[s]
-            if case.settings.estimator.denoises:
+            if case.settings.estimator.without_denoising():
                 denoised = fs.tv_denoise(
                     denoised,
                     each("noise_std")[s],

@@ -153,12 +153,12 @@ class TestTables:
     def test_posterior_of_known_flux_integrates_the_likelihood(self) -> None:
         """The table gives the log-likelihood ratio of Poisson pixels of variance v + m."""
         psf, v, flux = fs.PSF.analytic(), 0.5, 40.0
-        grid, spacing = spot_tables.posterior_grid(1.0, 1.9, (8, 8))
-        made = spot_tables.posterior_tables(
-            psf, np.array([0]), np.array([flux]), np.array([v]), 1.0, (grid, spacing), (8, 8), 16
+        grid, _ = spot_tables.posterior_grid(1.0, 1.9, (8, 8))
+        logarithms, constants = spot_tables.posterior_tables(
+            psf, np.array([0]), np.array([flux]), np.array([v]), 1.0, grid, (8, 8), 16
         )
         image = np.random.default_rng(2).poisson(psf.images([[0.2, -0.4]], (8, 8), flux)[0])
         mean = np.maximum(psf.images(grid, (8, 8), flux), 0.0)
         expected = ((image + v) * np.log((mean + v) / v) - mean).sum(axis=(1, 2))
-        found = (made.tables[0, :, :, :8] * image).sum(axis=(1, 2)) + made.constants[0]
+        found = (logarithms[0, :, :, :8] * image).sum(axis=(1, 2)) + constants[0]
         assert np.allclose(found, expected, rtol=1e-5, atol=1e-4)

@@ -24,13 +24,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from faintspot.base.checks import numbers_between, one_of
 from faintspot.base.errors import InputError
-from faintspot.slopes.estimators.automatic_constants import (
-    FEW,
-    KEPT,
-    SMOOTHING,
-    STRENGTH,
-    Constants,
-)
+from faintspot.slopes.estimators.automatic_constants import FEW, KEPT, SMOOTHING, STRENGTH, Constants
 
 _Values = np.float64 | NDArray[np.float64]  # one number, or an array
 _Truths = np.bool_ | NDArray[np.bool_]
@@ -102,8 +96,8 @@ def automatic_strength(
     """
     sensor = _sensor(flux_e, read_noise_e, **conditions)
     lost, off = _lost_and_off(sensor, KEPT["tv"])
-    gain = STRENGTH["gaussian"] if sensor.gaussian else STRENGTH["diffraction"]
-    wings = 0.0 if sensor.gaussian else STRENGTH["wings"]
+    gain = STRENGTH[sensor.profile]
+    wings = 0.0 if sensor.profile == "gaussian" else STRENGTH["wings"]
     matched = sensor.matched_squared
     freedom = 1 + (matched / STRENGTH["noise_freedom_at"] ** 2) ** (STRENGTH["noise_freedom_exponent"] / 2)
     freedom = STRENGTH["core_freedom"] * sensor.area + STRENGTH["noise_freedom"] / freedom
@@ -142,15 +136,13 @@ def automatic_smoothing(
     """
     sensor = _sensor(flux_e, read_noise_e, **conditions)
     lost, off = _lost_and_off(sensor, KEPT["smoothed"])
-    base, exponent = SMOOTHING.diffraction, SMOOTHING.photons_diffraction
-    if sensor.gaussian:
-        base, exponent = SMOOTHING.gaussian, SMOOTHING.photons_gaussian
-    noise = np.sqrt(sensor.variance) + SMOOTHING.tail * sensor.excess * sensor.counted
+    base, exponent = SMOOTHING[sensor.profile], SMOOTHING[f"photons_{sensor.profile}"]
+    noise = np.sqrt(sensor.variance) + SMOOTHING["tail"] * sensor.excess * sensor.counted
     contrast = np.maximum(sensor.flux / (sensor.area * noise), 1e-3)
-    found = base * (1 + SMOOTHING.faint * (3.0 / contrast) ** SMOOTHING.faint_exponent)
+    found = base * (1 + SMOOTHING["faint"] * (3.0 / contrast) ** SMOOTHING["faint_exponent"])
     found = found * (1 + sensor.core_photon_variance) ** exponent
-    scale = (sensor.area / 9.0) ** SMOOTHING.area_exponent
-    result: NDArray[np.float64] = np.where(off, 0.0, scale * np.where(lost, SMOOTHING.lost, found))[()]
+    scale = (sensor.area / 9.0) ** SMOOTHING["area_exponent"]
+    result: NDArray[np.float64] = np.where(off, 0.0, scale * np.where(lost, SMOOTHING["lost"], found))[()]
     return result
 
 
@@ -183,20 +175,11 @@ def automatic_kept_pixels(
     """
     one_of("method", method, METHODS)
     sensor = _sensor(flux_e, read_noise_e, **conditions)
-    if method == "none":
-        return _whole(_kept_without_denoising(sensor), sensor)
-    constants = KEPT[method]
-    lost, off = _lost_and_off(sensor, constants)
-    if np.all(off):
-        return _whole(_kept_without_denoising(sensor), sensor)
-    kept = _found(sensor, constants)
-    if np.any(lost):
-        scaled = sensor.prior_signal * (9.0 / sensor.area) ** constants["shrink_area"]
-        held = sensor.pixels * np.exp(-constants["shrink"] * scaled ** constants["shrink_exponent"])
-        kept = np.where(lost, np.maximum(held, kept), kept)
-    if np.any(off):
-        kept = np.where(off, _kept_without_denoising(sensor), kept)
-    return _whole(kept, sensor)
+    _, off = _lost_and_off(sensor, KEPT[method])
+    kept = np.where(off, _kept(sensor, KEPT["none"]), _kept(sensor, KEPT[method]))
+    # At least one pixel is left for the background.
+    whole: NDArray[np.int64] = np.minimum(np.maximum(np.rint(kept), 1), sensor.pixels - 1).astype(np.int64)
+    return whole
 
 
 class _Sensor(NamedTuple):
@@ -210,7 +193,7 @@ class _Sensor(NamedTuple):
     area: _Values
     elongation: _Values
     range_px: _Values
-    gaussian: bool
+    profile: str
 
     @property
     def matched_squared(self) -> _Values:
@@ -266,9 +249,7 @@ def _sensor(flux_e: ArrayLike, read_noise_e: ArrayLike, **conditions: Unpack[Con
     variance = np.maximum(read_noise**2 + excess * background, _SMALLEST_VARIANCE)
     area = _AREA_OF_SQUARED_FWHM[profile] * fwhm**2
     counted = excess * background / variance
-    return _Sensor(
-        flux, excess, variance, counted, n_pixels, area, long_axis, range_px, profile == "gaussian"
-    )
+    return _Sensor(flux, excess, variance, counted, n_pixels, area, long_axis, range_px, profile)
 
 
 def _lost(sensor: _Sensor, constants: Constants) -> _Truths:
@@ -288,7 +269,7 @@ def _lost_and_off(sensor: _Sensor, constants: Constants) -> tuple[_Truths, _Trut
 
 def _signal_with_photons(sensor: _Sensor) -> _Values:
     """Return D^2 including the photon noise of the spot itself."""
-    return sensor.matched_squared / (1 + FEW.photons * sensor.core_photon_variance)
+    return sensor.matched_squared / (1 + FEW["photons"] * sensor.core_photon_variance)
 
 
 def _found(sensor: _Sensor, constants: Constants) -> _Values:
@@ -297,7 +278,7 @@ def _found(sensor: _Sensor, constants: Constants) -> _Values:
     window = np.log1p(sensor.pixels / sensor.area) / 3.4  # 3.4: size 1 in 16 x 16 px
     signal = sensor.contrast(constants) / (threshold * window ** constants["threshold_window"])
     level, area = np.log1p(signal), sensor.area
-    if sensor.gaussian:
+    if sensor.profile == "gaussian":
         kept = constants["gaussian"] * (area + constants["gaussian_px"]) * level
     else:
         core = constants["core"] * (area + constants["core_px"]) * level
@@ -313,21 +294,16 @@ def _found(sensor: _Sensor, constants: Constants) -> _Values:
 
 def _few_photons(sensor: _Sensor) -> _Values:
     """Increase the number of pixels if photons are few and each stands out: then all of them contribute."""
-    base = FEW.gaussian if sensor.gaussian else FEW.diffraction
-    rarity = np.exp(-sensor.core_photons / FEW.rarity)
-    seen = 1 / (1 + sensor.variance / FEW.variance)
-    return base * sensor.area * rarity * seen * sensor.range_px**-FEW.range_exponent
+    rarity = np.exp(-sensor.core_photons / FEW["rarity"])
+    seen = 1 / (1 + sensor.variance / FEW["variance"])
+    return FEW[sensor.profile] * sensor.area * rarity * seen * sensor.range_px ** -FEW["range_exponent"]
 
 
-def _kept_without_denoising(sensor: _Sensor) -> _Values:
-    constants = KEPT["none"]
-    found = _found(sensor, constants)
-    signal = _signal_with_photons(sensor) * sensor.range_px**2 / sensor.pixels
+def _kept(sensor: _Sensor, constants: Constants) -> _Values:
+    """Return the number of pixels to keep for any spot; many if it is lost in noise."""
+    kept = _found(sensor, constants)
+    signal = sensor.prior_signal * (9.0 / sensor.area) ** constants["shrink_area"]
+    if constants is KEPT["none"]:
+        signal = _signal_with_photons(sensor) * sensor.range_px**2 / sensor.pixels
     held = sensor.pixels * np.exp(-constants["shrink"] * signal ** constants["shrink_exponent"])
-    return np.where(_lost(sensor, constants), np.maximum(held, found), found)
-
-
-def _whole(kept: _Values, sensor: _Sensor) -> NDArray[np.int64]:
-    """Round to whole numbers that leave at least one pixel for the background."""
-    whole: NDArray[np.int64] = np.minimum(np.maximum(np.rint(kept), 1), sensor.pixels - 1).astype(np.int64)
-    return whole
+    return np.where(_lost(sensor, constants), np.maximum(held, kept), kept)

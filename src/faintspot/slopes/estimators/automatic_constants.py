@@ -4,34 +4,8 @@ Symbols are those of faintspot.slopes.estimators.automatic.
 """
 
 from collections.abc import Mapping
-from typing import NamedTuple
 
 Constants = Mapping[str, float]
-
-
-class Smoothing(NamedTuple):
-    """Constants of the Gaussian smoothing."""
-
-    diffraction: float  # width at A = 9 of a bright spot, px
-    gaussian: float
-    area_exponent: float
-    faint: float
-    faint_exponent: float
-    tail: float  # of the background's noise, per electron
-    photons_diffraction: float  # exponents of 1 + photon noise of the core / v
-    photons_gaussian: float
-    lost: float  # width at A = 9 where the spot is lost, px
-
-
-class FewPhotons(NamedTuple):
-    """Constants of spots of few photons, without denoising."""
-
-    photons: float  # the spot's photon noise in D^2
-    diffraction: float  # pixels per area
-    gaussian: float
-    rarity: float  # q up to which photons are few
-    variance: float  # v up to which each stands out
-    range_exponent: float
 
 
 _KEPT = {  # number of kept pixels, after method "none", "tv" or "smoothed"
@@ -82,22 +56,22 @@ STRENGTH: Constants = {  # of the denoising
     "wings_window": 4.99,  # decrease with A / N: in a small window most flux is in the core
     "lost": 0.606,  # in units of sqrt(v), if the spot is lost
 }
-SMOOTHING = Smoothing(
-    diffraction=0.323,
-    gaussian=0.374,
-    area_exponent=0.133,
-    faint=1.16,
-    faint_exponent=0.47,
-    tail=1.1,
-    photons_diffraction=0.059,
-    photons_gaussian=0.0005,
-    lost=0.567,
-)
-FEW = FewPhotons(
-    photons=1.05,
-    diffraction=59.4,
-    gaussian=24.0,
-    rarity=0.51,
-    variance=0.0059,
-    range_exponent=4.0,
-)
+SMOOTHING: Constants = {  # of the Gaussian smoothing
+    "diffraction": 0.323,  # width at A = 9 of a bright spot, px
+    "gaussian": 0.374,
+    "area_exponent": 0.133,
+    "faint": 1.16,
+    "faint_exponent": 0.47,
+    "tail": 1.1,  # of the background's noise, per electron
+    "photons_diffraction": 0.059,  # exponents of 1 + photon noise of the core / v
+    "photons_gaussian": 0.0005,
+    "lost": 0.567,  # width at A = 9 where the spot is lost, px
+}
+FEW: Constants = {  # of spots of few photons, without denoising
+    "photons": 1.05,  # the spot's photon noise in D^2
+    "diffraction": 59.4,  # pixels per area
+    "gaussian": 24.0,
+    "rarity": 0.51,  # q up to which photons are few
+    "variance": 0.0059,  # v up to which each stands out
+    "range_exponent": 4.0,
+}

@@ -7,7 +7,7 @@ never tests its name.
 from __future__ import annotations
 
 import enum
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple, Self
 
@@ -128,11 +128,6 @@ class Estimator(Options):
         """Whether knowing the mean flux (see `faintspot.MeanFlux`) improves the estimate."""
         return False
 
-    @property
-    def denoises(self) -> bool:
-        """Whether the images are denoised before the position is measured."""
-        return False
-
     def without_denoising(self) -> Estimator | None:
         """Return the same estimator without denoising, or None if it does not denoise."""
         return None
@@ -247,6 +242,10 @@ class EstimatorPlan:
 
     kernel: Any = None
     """Compiled function that measures groups of sub-apertures: see `kernels.groups`."""
+    tables: Any = None
+    """Tables that the kernel reads in addition to the settings: a NamedTuple."""
+    own_scratch: Any = None
+    """Function that allocates the kernel's scratch memory; unchanged as long as `tables` are."""
     setting_rows: int = COMMON_ROWS
     """Number of rows in the settings table."""
     needs_flux: bool = False
@@ -259,6 +258,8 @@ class EstimatorPlan:
     """Row of 1 / prior_std_px^2 in the settings table, for a prior whose width may change between frames."""
     in_python: bool = False
     """Whether the kernel only calibrates the images, and `locate_frame` finds the positions."""
+    locate_frame: Any = None
+    """Function that writes the slopes of one frame where `in_python`: see `estimators.python.PythonPlan`."""
     fewer_lanes_are_faster: bool = False
     """Whether an incomplete group is measured faster with a narrower SIMD vector."""
     pixel_variance: Floats
@@ -286,27 +287,6 @@ class EstimatorPlan:
 
     def fill_flux(self, table: NDArray[np.float32], flux_e: Floats) -> None:
         """Fill the rows that depend on the flux [electrons] of each sub-aperture; NaN where it is unknown."""
-
-    def locate_frame(
-        self,
-        images: NDArray[np.float32],
-        prior: NDArray[np.float32],
-        table: NDArray[np.float32],
-        frame: int,
-        slopes: Any,
-    ) -> None:
-        """Write the slopes of one frame where `in_python`; see `estimators.python.PythonPlan`."""
-        raise NotImplementedError
-
-    @property
-    def tables(self) -> tuple[object, ...]:
-        """Tables that the kernel reads in addition to the settings: a NamedTuple."""
-        raise NotImplementedError
-
-    @property
-    def own_scratch(self) -> Callable[..., tuple[object, ...]]:
-        """Function that allocates the kernel's scratch memory; unchanged as long as `tables` are."""
-        raise NotImplementedError
 
 
 __all__ = [

@@ -1,7 +1,6 @@
 """Estimators in plain NumPy: the compiled kernel calibrates the images, Python finds the positions."""
 
 import sys
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -58,6 +57,8 @@ class PythonPlan(EstimatorPlan):
     """
 
     kernel = staticmethod(gravity.gravity_of_groups)
+    own_scratch = staticmethod(gravity.gravity_scratch)
+    tables = gravity.GravityTables()
     setting_rows = gravity.SETTING_ROWS
     in_python = True
 
@@ -70,16 +71,6 @@ class PythonPlan(EstimatorPlan):
                 f"estimator {estimator.name!r}: expected a class with `locate` or `prepared`, got neither"
             )
         self.found(typical_images(sensor.n, sensor.window), sensor.zero.copy())
-
-    @property
-    def tables(self) -> gravity.GravityTables:
-        """See `EstimatorPlan`."""
-        return gravity.GravityTables()
-
-    @property
-    def own_scratch(self) -> Callable[..., gravity.GravityScratch]:
-        """See `EstimatorPlan`."""
-        return gravity.gravity_scratch
 
     def fill_flux(self, table: NDArray[np.float32], flux_e: NDArray[np.float64]) -> None:
         """See `EstimatorPlan`."""

@@ -11,15 +11,11 @@ from functools import cache
 from importlib import import_module
 from importlib.metadata import entry_points
 from types import FrameType
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
 from faintspot.base.errors import InputError, import_modules
 from faintspot.base.options import Option, Options
 from faintspot.slopes.estimators.base import Estimator, Need
-
-if TYPE_CHECKING:
-    from faintspot.slopes.estimators.base import Estimator
-
 
 _LONGEST = 300
 

@@ -219,36 +219,6 @@ def least_flux(
 # Posterior on a grid --------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class PosteriorGrid:
-    """Log-likelihoods of the positions of a grid, see `faintspot.slopes.kernels.means`."""
-
-    tables: NDArray[np.float32]
-    constants: NDArray[np.float32]
-    grid: NDArray[np.float32]
-    spacing: float
-
-    @property
-    def arguments(self) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32], float]:
-        """Arguments of the kernel."""
-        return self.tables, self.constants, self.grid, self.spacing
-
-
-NO_POSTERIOR = PosteriorGrid(
-    np.zeros((1, 1, 1, 1), np.float32), np.zeros((1, 1), np.float32), np.zeros((1, 2), np.float32), 1.0
-)
-
-
-def joined(parts: list[PosteriorGrid]) -> PosteriorGrid:
-    """Concatenate the tables of several levels of flux on the same grid."""
-    return PosteriorGrid(
-        np.concatenate([part.tables for part in parts]),
-        np.concatenate([part.constants for part in parts]),
-        parts[0].grid,
-        parts[0].spacing,
-    )
-
-
 def posterior_grid(
     reach_px: float, fwhm_px: float, window: tuple[int, int]
 ) -> tuple[NDArray[np.float32], float]:
@@ -273,15 +243,16 @@ def posterior_tables(
     flux_e: Floats,
     variance: Floats,
     excess: float,
-    grid_and_spacing: tuple[NDArray[np.float32], float],
+    grid: NDArray[np.float32],
     window: tuple[int, int],
     width: int,
-) -> PosteriorGrid:
-    """Compute the tables of a `posterior_grid` for triples of a PSF, a flux and variances of the dark pixels.
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Compute log-likelihoods on a `posterior_grid` for triples of PSF, flux and variances of dark pixels.
 
-    Those are (n, ny, nx), or (n, 1, 1) where they are the same in all pixels.
+    Those are (n, ny, nx), or (n, 1, 1) where they are the same in all pixels. Returns `logarithms` and
+    `constants` of `kernels.fits.PosteriorTables`.
     """
-    nx, (grid, spacing) = window[1], grid_and_spacing
+    nx = window[1]
     variance = np.maximum(variance, SMALLEST_VARIANCE)
     tables = np.zeros((len(flux_e), *posterior_shape(len(grid), window, width)), np.float32)
     constants = np.empty((len(flux_e), len(grid)), np.float32)
@@ -295,4 +266,4 @@ def posterior_tables(
             logarithm = np.log1p(excess * mean / v)
             tables[i, part, :, :nx] = logarithm / excess
             constants[i, part] = (v / excess**2 * logarithm - mean / excess).sum(axis=(1, 2))
-    return PosteriorGrid(tables, constants, grid, spacing)
+    return tables, constants

@@ -112,17 +112,12 @@ class Settings:
 
     def __getattr__(self, name: str) -> Any:
         """Return an option of the estimator or a shared option."""
-        if not name.startswith("_"):
-            for part in (self._shared, self.estimator):
-                if name in part.declared():
-                    return getattr(part, name)
+        if name.startswith("_"):  # as asked for while settings are unpickled
+            raise AttributeError(name)
+        for part in (self._shared, self.estimator):
+            if name in part.declared():
+                return getattr(part, name)
         raise AttributeError(f"settings have no option {name!r}; there are {', '.join(self.declared())}")
-
-    def __getstate__(self) -> dict[str, Any]:
-        return dict(vars(self))
-
-    def __setstate__(self, state: Mapping[str, object]) -> None:
-        vars(self).update(state)
 
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, Settings):

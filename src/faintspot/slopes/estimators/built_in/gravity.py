@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any, ClassVar
 
 import numpy as np
@@ -104,6 +103,12 @@ class KeepingBrightest(Centroid):
         """
         return None
 
+    def without_denoising(self) -> BrightestPixels | None:
+        """See `Estimator`."""
+        if self.strength_option is None:
+            return None
+        return BrightestPixels(**{name: getattr(self, name) for name in BrightestPixels.declared()})
+
     def for_bright_flux(self) -> Estimator:
         """Keep the default number of pixels if the number is automatic."""
         return self.replaced({"keep_brightest": None}) if is_auto(self.keep_brightest) else self
@@ -126,6 +131,8 @@ class GravityPlan(EstimatorPlan):
     """Settings and tables of a centre of gravity."""
 
     kernel = staticmethod(gravity.gravity_of_groups)
+    own_scratch = staticmethod(gravity.gravity_scratch)
+    tables: Any = gravity.GravityTables()
     setting_rows = gravity.SETTING_ROWS
     fewer_lanes_are_faster = True
 
@@ -136,20 +143,6 @@ class GravityPlan(EstimatorPlan):
         self._keeping = estimator if isinstance(estimator, KeepingBrightest) else None
         automatic = self._keeping is not None and self._keeping.is_automatic
         self.needs_flux = automatic and bool(np.isnan(sensor.flux_e).all())
-
-    # Tables of the kernels ------------------------------------------------------------------------------
-
-    @cached_property
-    def tables(self) -> gravity.GravityTables:
-        """Tables of the step before the background subtraction."""
-        return gravity.GravityTables()
-
-    @property
-    def own_scratch(self) -> Callable[..., gravity.GravityScratch]:
-        """See `EstimatorPlan`."""
-        return gravity.gravity_scratch
-
-    # Settings ---------------------------------------------------------------------------------------
 
     def fill(self, table: NDArray[np.float32]) -> None:
         """See `EstimatorPlan`."""
@@ -212,11 +205,6 @@ class BrightestPixels(KeepingBrightest):
     cost = 0.21
     style = Style("#000000", "--", "o")
     automatic_method = "none"
-
-    @classmethod
-    def like(cls, other: KeepingBrightest) -> BrightestPixels:
-        """Return an estimator with the background subtraction of `other` and no denoising."""
-        return cls(**{name: getattr(other, name) for name in cls.declared()})
 
     def in_words(self, n_subapertures: int, pixels: int) -> str:
         """See `Estimator`."""

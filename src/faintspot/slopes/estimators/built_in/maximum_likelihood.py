@@ -6,22 +6,24 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
-from typing import ClassVar, Self
+from typing import Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
+from faintspot.base.checks import not_none
 from faintspot.base.files import MOST_NUMBERS, check_size
 from faintspot.base.options import Value, option
 from faintspot.base.tables import PRESETS
 from faintspot.slopes.estimators import spot_tables
-from faintspot.slopes.estimators.base import Estimator, Need, Style
+from faintspot.slopes.estimators.base import Need, Style
 from faintspot.slopes.estimators.built_in.weighted import SpotPlan, Stepping
 from faintspot.slopes.estimators.registry import register
 from faintspot.slopes.estimators.sensor import Scene, Sensor
-from faintspot.slopes.estimators.spot_tables import NO_POSTERIOR, PosteriorGrid, SpotModel, model_of_psf
+from faintspot.slopes.estimators.spot_tables import SpotModel, model_of_psf
 from faintspot.slopes.kernels import fits as spot_fits
 from faintspot.slopes.kernels.groups import RANGE, flux_above_edges
+from faintspot.slopes.spots.psf import PSF
 
 Floats = NDArray[np.float64]
 
@@ -34,7 +36,7 @@ _LEARNT_WEIGHT_FLOOR = 1e-3
 class Likelihood(Stepping):
     """Fit of the PSF to the image, whose weights follow from the noise."""
 
-    blur_px: Value = option(
+    blur_px: Any = option(
         0.0,
         "Standard deviation of the Gaussian blur applied to the PSF, for broadening by turbulence.",
         unit="px",
@@ -103,7 +105,9 @@ class LikelihoodPlan(SpotPlan):
 
     kernel = staticmethod(spot_fits.fitted_of_groups)
 
-    def __init__(self, estimator: Estimator, sensor: Sensor) -> None:
+    estimator: Likelihood
+
+    def __init__(self, estimator: Likelihood, sensor: Sensor) -> None:
         super().__init__(estimator, sensor)
         if self.rounds_electrons:
             noise = sensor.pixel_noise_e
@@ -115,6 +119,18 @@ class LikelihoodPlan(SpotPlan):
         """Profiles of the spots."""
         sensor = self.sensor
         return model_of_psf(self.psf, sensor.n, sensor.window, sensor.width, self.fits_background)
+
+    @cached_property
+    def psf(self) -> PSF:
+        """PSF of the sensor, blurred if the estimator requires it."""
+        psf, blur = not_none(self.sensor.psf), self.estimator.blur_px
+        return psf.blurred(float(blur)) if blur > 0 else psf
+
+    @cached_property
+    def fits_background(self) -> bool:
+        """See `SpotPlan`."""
+        choice = self.estimator.local_background
+        return choice == "on" or (choice == "auto" and not self.sensor.calibration.dark_is_known)
 
     @property
     def rounds_electrons(self) -> bool:
@@ -201,33 +217,23 @@ class _MaximumAPosterioriPlan(LikelihoodPlan):
         self.needs_flux = bool(np.isnan(sensor.flux_e).all())
         if self.fits_background:
             self.flux_kernel = flux_above_edges
-        self._posteriors: list[PosteriorGrid] = []
+        self._parts: list[tuple[NDArray[np.float32], NDArray[np.float32]]] = []
         self._levels: dict[float, int] = {}  # first table of each level of flux measured so far
-        self._scratch = (-1, partial(spot_fits.spot_scratch))
-        self._grid, self._spacing = NO_POSTERIOR.grid, NO_POSTERIOR.spacing
+        self._grid, self._spacing = np.zeros((0, 2), np.float32), 0.0
         self.table_shape = (0, 0, 0)
         """Shape of the table of each kind of sub-aperture: positions, rows, columns."""
 
     @property
     def tables(self) -> spot_fits.PosteriorTables:
         """See `EstimatorPlan`."""
-        if len(self._posteriors) > 1:
-            self._posteriors = [spot_tables.joined(self._posteriors)]
-        found = self._posteriors[0] if self._posteriors else NO_POSTERIOR
-        return spot_fits.PosteriorTables(
-            self.model_tables, found.tables, found.constants, found.grid, found.spacing
-        )
+        logarithms, constants = (np.concatenate(parts) for parts in zip(*self._parts, strict=True))
+        self._parts = [(logarithms, constants)]
+        return spot_fits.PosteriorTables(self.model_tables, logarithms, constants, self._grid, self._spacing)
 
-    @property
+    @cached_property
     def own_scratch(self) -> partial[spot_fits.SpotScratch]:
         """See `EstimatorPlan`."""
-        positions = len(self.tables.grid)
-        if self._scratch[0] != positions:
-            make = partial(
-                spot_fits.spot_scratch, rank=self.model.rank, taps=self.taps.shape[2], positions=positions
-            )
-            self._scratch = positions, make
-        return self._scratch[1]
+        return partial(super().own_scratch, positions=len(self._grid))
 
     def fill(self, table: NDArray[np.float32]) -> None:
         """See `EstimatorPlan`."""
@@ -252,7 +258,7 @@ class _MaximumAPosterioriPlan(LikelihoodPlan):
         super().fill_flux(table, flux_e)
         sensor = self.sensor
         kinds, which = self._kinds(flux_e)
-        before = sum(len(part.tables) for part in self._posteriors)
+        before = sum(len(logarithms) for logarithms, _ in self._parts)
         if self._levels and (before + len(kinds)) * math.prod(self.table_shape) > MOST_NUMBERS:
             nearest = min(self._levels, key=lambda level: abs(math.log(level / flux_e[0])))
             table[spot_fits.KIND] = self._levels[nearest] + which
@@ -265,11 +271,11 @@ class _MaximumAPosterioriPlan(LikelihoodPlan):
             kinds[:, 1],
             self.pixel_variance[kinds[:, 3].astype(np.int64)] + (kinds[:, 2] * kinds[:, 1])[:, None, None],
             sensor.excess_noise,
-            (self._grid, self._spacing),
+            self._grid,
             sensor.window,
             sensor.width,
         )
-        self._posteriors.append(made)
+        self._parts.append(made)
         table[spot_fits.KIND] = before + which
 
     def _kinds(self, flux_e: Floats) -> tuple[Floats, NDArray[np.int64]]:

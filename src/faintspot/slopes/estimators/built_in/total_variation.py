@@ -8,17 +8,13 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from faintspot.base.checks import not_none
 from faintspot.base.errors import InputError
 from faintspot.base.options import PerSubaperture, Value, is_auto, option
 from faintspot.base.tables import FEW_KEPT, PRESETS, of_denoising
 from faintspot.slopes.estimators.automatic import automatic_smoothing, automatic_strength
 from faintspot.slopes.estimators.base import BACKGROUND, CALIBRATED, RAW, Estimator, Step, Style
-from faintspot.slopes.estimators.built_in.gravity import (
-    BrightestPixels,
-    Floats,
-    GravityPlan,
-    KeepingBrightest,
-)
+from faintspot.slopes.estimators.built_in.gravity import Floats, GravityPlan, KeepingBrightest
 from faintspot.slopes.estimators.noise import ALGORITHMS, suggested_strength, tv_denoise
 from faintspot.slopes.estimators.registry import register
 from faintspot.slopes.estimators.sensor import Scene, Sensor
@@ -91,22 +87,13 @@ class TotalVariation(KeepingBrightest):
             )
 
     @property
-    def denoises(self) -> bool:
-        """See `Estimator`."""
-        return True
-
-    @property
     def is_automatic(self) -> bool:
         """See `KeepingBrightest`."""
         return is_auto(self.noise_std) or is_auto(self.keep_brightest)
 
-    def without_denoising(self) -> BrightestPixels:
-        """See `Estimator`."""
-        return BrightestPixels.like(self)
-
     def for_bright_flux(self) -> Estimator:
         """Do not denoise: a noise-free image has nothing to remove."""
-        return self.without_denoising().for_bright_flux()
+        return not_none(self.without_denoising()).for_bright_flux()
 
     def values(self, name: str, n_subapertures: int, pixels: int) -> NDArray[Any]:
         """See `Options`; tolerance and iteration limit depend on the number of pixels kept."""
@@ -218,15 +205,6 @@ class Smoothed(KeepingBrightest):
     steps_shown = (RAW, CALIBRATED, Step("smoothed", "denoised"), BACKGROUND)
     automatic_method = "smoothed"
     strength_option = "smoothing_px"
-
-    @property
-    def denoises(self) -> bool:
-        """See `Estimator`."""
-        return True
-
-    def without_denoising(self) -> BrightestPixels:
-        """See `Estimator`."""
-        return BrightestPixels.like(self)
 
     def default_of(self, name: str, pixels: int) -> float:
         """See `Options`."""

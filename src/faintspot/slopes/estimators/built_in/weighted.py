@@ -57,6 +57,10 @@ class SpotPlan(EstimatorPlan):
     """Settings and tables of an estimator that uses profiles of spots, or of weights centred on them."""
 
     setting_rows = spot_fits.SETTING_ROWS
+    rounds_electrons: Any = False
+    """Whether images are rounded to whole electrons."""
+    fits_background: Any = False
+    """Whether a constant background is fitted along with the spot."""
 
     estimator: Stepping
 
@@ -71,26 +75,11 @@ class SpotPlan(EstimatorPlan):
         return np.ascontiguousarray(self.model.taps[self.model.index])
 
     @property
-    def step_count(self) -> int:
-        """Number of steps of the fit."""
-        return self.estimator.step_count
-
-    @property
-    def rounds_electrons(self) -> bool:
-        """Whether images are rounded to whole electrons."""
-        return False
-
-    @cached_property
-    def fits_background(self) -> bool:
-        """Whether a constant background is fitted along with the spot."""
-        choice = getattr(self.estimator, "local_background", "off")
-        return choice == "on" or (choice == "auto" and not self.sensor.calibration.dark_is_known)
-
-    @property
     def model_tables(self) -> spot_fits.ModelTables:
         """Tables of the kernels that use a profile."""
+        steps = self.estimator.step_count
         return spot_fits.ModelTables(
-            self.step_count, self.rounds_electrons, self.fits_background, self.taps, self.model.tables
+            steps, self.rounds_electrons, self.fits_background, self.taps, self.model.tables
         )
 
     @property
@@ -140,9 +129,8 @@ class SpotPlan(EstimatorPlan):
 
     @cached_property
     def psf(self) -> Any:
-        """PSF of the sensor, blurred if the estimator requires it."""
-        psf, blur = self.sensor.psf, float(getattr(self.estimator, "blur_px", 0.0))
-        return psf.blurred(blur) if psf is not None and blur > 0 else psf
+        """PSF of the spots."""
+        return self.sensor.psf
 
 
 _WIDTHS = (1.0, 0.6, 0.8, 1.25, 1.6, 2.2)  # multiples of the spot's width
