@@ -10,7 +10,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from tests.refusals import assert_each_refused, refused
 
-from faintspot.base.errors import InputError
 from faintspot.slopes.simulate import Detector
 from faintspot.slopes.spots.bounds import MEAN_ABSOLUTE, cramer_rao, cramer_rao_covariance, photon_efficiency
 from faintspot.slopes.spots.psf import PSF
@@ -117,7 +116,7 @@ def test_negative_wings_tell_nothing() -> None:
         for part in (2e-3, 0.0)
     ]
     # A tenth of the flux, which is normalised, is taken from the wings, whose lost part had information.
-    np.testing.assert_allclose(*bounds, rtol=0.3)
+    np.testing.assert_allclose(bounds[0], bounds[1], rtol=0.3)
 
 
 @given(flux=st.floats(1, 1e4), read_noise=st.sampled_from([0.0, 0.1, 1.0, 3.0]), share=st.floats(0.1, 1))
@@ -150,15 +149,10 @@ def test_wrong_values_are_refused() -> None:
     assert_each_refused(cramer_rao, flux_e=[0.0])
     with refused("psf: expected no size beside it"):
         cramer_rao(10.0, psf=PSF.analytic(), size=1.2)
-
-
-def test_impossible_efficiencies_are_refused() -> None:
-    with pytest.raises(InputError, match="error_px"):
-        photon_efficiency(0.0, 10.0)
-    with pytest.raises(InputError, match="shapes"):
+    assert_each_refused(partial(photon_efficiency, flux_e=10.0), error_px=[0.0, 1e-20, 1e20])
+    with refused("error_px, flux_e"):
         photon_efficiency([0.1, 0.2], [1.0, 2.0, 3.0])
-    with pytest.raises(InputError, match="1e-20"):
-        photon_efficiency(1e-20, 10.0)
+    assert_each_refused(partial(cramer_rao_covariance, psf=PSF.analytic()), flux_e=[0.0, [1.0, 1.0]])
 
 
 def test_the_covariance_of_elongated_spots_is_that_of_their_axes() -> None:
@@ -173,5 +167,3 @@ def test_the_covariance_of_elongated_spots_is_that_of_their_axes() -> None:
     # The pixels hardly matter at this width.
     np.testing.assert_allclose(found[1], turn @ found[0] @ turn.T, rtol=0.02)
     np.testing.assert_allclose(found[2], found[0][::-1, ::-1], rtol=1e-3, atol=1e-9)
-    with refused():
-        cramer_rao_covariance([1.0, 0.0, 1.0], psf)

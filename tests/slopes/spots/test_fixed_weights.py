@@ -98,12 +98,6 @@ def test_without_known_flux_the_frame_says_it() -> None:
     np.testing.assert_allclose(pipeline(frame).vector, pipeline(3 * frame).vector, atol=1e-5)
 
 
-def test_mean_flux_needs_the_flux() -> None:
-    settings = fs.Settings(Window(normalisation="mean"), spot_fwhm_px=2.0)
-    with pytest.raises(fs.InputError, match=r"settings.flux_e: expected the flux"):
-        fs.SlopePipeline(fs.Layout.grid((2, 2), pixels=8), settings)
-
-
 def test_spots_without_flux_are_flagged() -> None:
     settings = window(2.0).replace(flux_e=np.array([60.0, 1e-6]))
     clean, _ = spots_of_a_loop(2, 3)
@@ -157,21 +151,26 @@ def test_files_give_back_the_weights(tmp_path: Path, learnt: fs.FixedWeights) ->
         np.testing.assert_array_equal(getattr(again, name), getattr(learnt, name))
 
 
-def test_what_is_refused() -> None:
-    sound = partial(fs.FixedWeights, x=np.ones((4, 4)), y=np.ones((4, 4)), mean_spot=np.full((4, 4), 1 / 16))
+def test_what_is_refused(learnt: fs.FixedWeights) -> None:
+    maps = {"x": np.ones((4, 4)), "y": np.ones((4, 4)), "mean_spot": np.full((4, 4), 1 / 16)}
     assert_each_refused(
-        sound,
+        partial(fs.FixedWeights, **maps),
         x=[np.zeros((2, 2, 2, 2)), np.full((4, 4), np.nan), np.full((4, 4), 1e30)],
         y=[np.zeros((3, 3))],
         mean_spot=[np.zeros((4, 4))],
         flux=[np.ones((5, 4))],
         index=[[[0]], [1]],
     )
-
-
-def test_weights_of_another_window_are_refused(learnt: fs.FixedWeights) -> None:
-    with pytest.raises(fs.InputError, match="expected windows of 8 x 8 px as in the layout, got 12 x 12"):
-        fs.SlopePipeline(fs.Layout.grid((2, 2), pixels=8), fs.Settings("window"), score=learnt)
+    matched = partial(fs.FixedWeights.matched, ELONGATED, (SIDE, SIDE), flux_e=10.0, read_noise_e=1.0)
+    assert_each_refused(matched, flux_e=[0.0, [1.0] * 3], read_noise_e=[-1.0])
+    assert_each_refused(partial(fs.FixedWeights.shaped, ELONGATED, (SIDE, SIDE)), power=[-1.0])
+    with refused("psf"):
+        fs.FixedWeights.shaped(ELONGATED, (1, 1))
+    layout = fs.Layout.grid((2, 2), pixels=8)
+    with refused("windows of 8 x 8 px", "got 12 x 12"):
+        fs.SlopePipeline(layout, fs.Settings("window"), score=learnt)
+    with refused("settings.flux_e"):
+        fs.SlopePipeline(layout, fs.Settings(Window(normalisation="mean"), spot_fwhm_px=2.0))
 
 
 ELONGATED = fs.PSF.analytic(
@@ -226,14 +225,3 @@ def test_weights_of_psfs_work_in_a_pipeline_per_subaperture() -> None:
     slopes = fs.SlopePipeline(layout, fs.Settings("window", flux_e=1e4), score=weights)(frame)
     # Moves of a tenth of a pixel are linear to 1 %.
     np.testing.assert_allclose(np.stack([slopes.x, slopes.y], axis=1), truth, atol=2e-3)
-
-
-def test_weights_of_impossible_spots_are_refused() -> None:
-    for options in ({"flux_e": 0.0}, {"flux_e": [1.0] * 3}, {"read_noise_e": -1.0}):
-        known: dict[str, Any] = {"flux_e": 10.0, "read_noise_e": 1.0, **options}
-        with refused():
-            fs.FixedWeights.matched(ELONGATED, (SIDE, SIDE), **known)
-    with refused():
-        fs.FixedWeights.shaped(ELONGATED, (SIDE, SIDE), power=-1.0)
-    with refused():
-        fs.FixedWeights.shaped(ELONGATED, (1, 1))

@@ -5,10 +5,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tests.refusals import refused
+from tests.refusals import assert_each_refused, refused
 
 import faintspot as fs
-from faintspot.base.errors import InputError
 from faintspot.experiments import Question
 from faintspot.experiments.planner.text import foundations
 from faintspot.slopes.spots.laser_spots import LaserSpots
@@ -45,30 +44,25 @@ def test_a_profile_from_a_file(tmp_path: Path) -> None:
     assert "elongated by 2.2 px" in spots.in_words(0.5, (10, 10))
 
 
-@pytest.mark.parametrize(
-    ("changes", "known"),
-    [
-        ({"at_m": None}, {}),
-        ({"at_m": [3.6]}, {}),
-        ({"launch_m": [np.nan, 0.0]}, {}),
-        ({"spot_fwhm_arcsec": 0}, {}),
-        ({"profile": 3}, {}),
-        ({"profile": "none.npz"}, {}),
-        ({"zenith": 3}, {}),
-        ({"zenith_distance_deg": 90}, {}),
-        ({"spot_fwhm_arcsec": 30}, {}),
-        ({}, {"pixel_scale_arcsec": None}),
-    ],
-)
-def test_what_is_refused(changes: dict[str, Any], known: dict[str, Any]) -> None:
-    """Also a window shorter than the spot."""
-    values = {name: value for name, value in {**LASER, **changes}.items() if value is not None}
-    with refused():
-        question(LaserSpots.from_table(values), **known)
-
-
-def test_not_with_other_spots() -> None:
-    spots = LaserSpots([-5.0, 0.0], 1.0, [0.0, 0.0])
-    known: dict[str, Any] = {"read_noise_e": 1.0, "pixels": 8, "flux_e": 100.0, "pixel_scale_arcsec": 0.5}
-    with pytest.raises(InputError, match="laser"):
-        Question(**known, laser=spots, psf=fs.PSF.analytic())
+def test_what_is_refused() -> None:
+    """Also a window shorter than the spot, and other spots beside it."""
+    assert_each_refused(
+        lambda **changes: question(LaserSpots.from_table({**LASER, **changes})),
+        at_m=[[3.6]],
+        launch_m=[[np.nan, 0.0]],
+        spot_fwhm_arcsec=[0],
+        profile=[[3.0]],
+        zenith=["3"],
+        zenith_distance_deg=[90],
+    )
+    with refused("none.npz"):
+        LaserSpots.from_table({**LASER, "profile": "none.npz"})
+    nowhere = {name: value for name, value in LASER.items() if name != "at_m"}
+    for values, known in (
+        (nowhere, {}),
+        ({**LASER, "spot_fwhm_arcsec": 30}, {}),
+        (LASER, {"pixel_scale_arcsec": None}),
+        (LASER, {"psf": fs.PSF.analytic()}),
+    ):
+        with refused():
+            question(LaserSpots.from_table(values), **known)

@@ -1,11 +1,12 @@
 """Sodium profiles: their convention, their moments and their checks."""
 
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from tests.refusals import refused
+from tests.refusals import assert_each_refused
 
 import faintspot as fs
 from faintspot.slopes.spots.sodium import integration_points
@@ -43,27 +44,14 @@ def test_a_file_gives_it_back(tmp_path: Path) -> None:
     np.testing.assert_allclose(back.density, profile.density, rtol=1e-12)
 
 
-@pytest.mark.parametrize(
-    ("altitudes", "density"),
-    [
-        ([80e3, 90e3], [1.0, -0.1]),
-        ([90e3, 80e3], [1.0, 1.0]),
-        ([80e3, 80e3], [1.0, 1.0]),
-        ([80e3, 90e3], [0.0, 0.0]),
-        ([80e3, 90e3], [1.0, np.nan]),
-        ([80e3, 90e3], [1.0]),
-        ([80e3], [1.0]),
-    ],
-)
-def test_impossible_profiles_are_refused(altitudes: Any, density: Any) -> None:
-    with refused():
-        fs.SodiumProfile(altitudes, density)
-
-
-def test_impossible_layers_are_refused() -> None:
-    with refused():
-        fs.SodiumProfile.peaks([90e3], [0.0], [1.0])
-    with refused():
-        fs.SodiumProfile.peaks([90e3, 95e3], [5e3], [1.0])
-    with refused():
-        fs.SodiumProfile.gaussian().at([95e3, 90e3])
+def test_impossible_profiles_are_refused() -> None:
+    assert_each_refused(
+        partial(fs.SodiumProfile, altitudes_m=[80e3, 90e3], density=[1.0, 1.0]),
+        altitudes_m=[[90e3, 80e3], [80e3, 80e3], [80e3]],
+        density=[[1.0, -0.1], [0.0, 0.0], [1.0, np.nan], [1.0]],
+    )
+    layer: dict[str, Any] = {"means_m": [90e3], "fwhms_m": [5e3], "fractions": [1.0]}
+    assert_each_refused(
+        partial(fs.SodiumProfile.peaks, **layer), fwhms_m=[[0.0]], means_m=[[90e3, 95e3]], bins=[1]
+    )
+    assert_each_refused(fs.SodiumProfile.gaussian().at, altitudes_m=[[95e3, 90e3]])

@@ -1,9 +1,11 @@
 """Centroid gains from spots that are moved."""
 
+from functools import partial
 from typing import Any
 
 import numpy as np
 import pytest
+from tests.refusals import assert_each_refused
 
 import faintspot as fs
 from faintspot.slopes.estimators.built_in.window import Window
@@ -60,18 +62,15 @@ def prepared_gain(pipeline: fs.SlopePipeline) -> Any:
     return 0.5 / np.abs(prepared.weights.x).max()
 
 
-@pytest.mark.parametrize(
-    ("slopes", "moved", "message"),
-    [
-        (np.zeros((10, 4)), np.zeros((10, 2)), "at least 40 frames"),
-        (np.zeros((50, 3)), np.zeros((50, 2)), "n_frames, 2 n"),
-        (np.zeros((50, 4)), np.zeros((50, 3)), "displacement_px: expected shape"),
-        (np.zeros((50, 4)), np.zeros((50, 2)), "expected all spots to move"),
-    ],
-)
-def test_what_is_refused(slopes: Any, moved: Any, message: str) -> None:
-    with pytest.raises(fs.InputError, match=message):
-        measure_centroid_gain(slopes, moved)
+def test_what_is_refused() -> None:
+    assert_each_refused(
+        partial(measure_centroid_gain, displacement_px=np.eye(50, 2)),
+        slopes=[np.zeros((10, 4)), np.zeros((50, 3)), np.zeros(50)],
+    )
+    assert_each_refused(
+        partial(measure_centroid_gain, np.zeros((50, 4))),
+        displacement_px=[np.zeros((50, 3)), np.zeros((50, 2))],
+    )
 
 
 SHAPE, SPOTS = (12, 12), 600

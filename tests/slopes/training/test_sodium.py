@@ -1,11 +1,12 @@
 """Sodium profiles learnt from mean images: exact without noise, near the truth with it, and checked."""
 
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
 import pytest
-from tests.refusals import refused
+from tests.refusals import assert_each_refused, refused
 
 import faintspot as fs
 from faintspot.slopes.training import MeanImages, fit_sodium_profile, fit_spot
@@ -85,28 +86,23 @@ def test_running_means_forget_slowly() -> None:
     np.testing.assert_allclose(mean.images_e - frames.mean(axis=0), 1 - np.exp(-0.01))
 
 
-def test_impossible_means_are_refused() -> None:
+def test_what_is_refused() -> None:
     images, slopes = np.ones((4, 5, 5)), np.zeros((4, 2))
-    for wrong in ((images[0], slopes), (images, slopes[:3]), (images * np.nan, slopes)):
-        with refused():
-            MeanImages(*wrong)
-    with refused():
-        MeanImages(images, slopes, time_constant_frames=0.0)
-    with refused():
-        MeanImages(images, slopes).updated(images[:, 1:], slopes)
-
-
-def test_impossible_fits_are_refused() -> None:
+    assert_each_refused(
+        partial(MeanImages, images_e=images, slopes_px=slopes),
+        images_e=[images[0], images * np.nan],
+        slopes_px=[slopes[:3]],
+        time_constant_frames=[0.0],
+    )
+    assert_each_refused(
+        partial(MeanImages(images, slopes).updated, slopes_px=slopes), images_e=[images[:, 1:]]
+    )
     mean = mean_images()
     few = MeanImages(mean.images_e[:3], mean.slopes_px[:3])
-    dark = replace(mean, images_e=0.0 * mean.images_e)
-    for wrong in (few, dark):
-        with refused():
+    for wrong in (few, replace(mean, images_e=0.0 * mean.images_e)):
+        with refused("images_e"):
             fit_sodium_profile(wrong, STAR, START)
-    for options in ({"dark_variance_e2": -1.0}, {"dark_variance_e2": [1.0, 2.0]}):
-        known: dict[str, Any] = options
-        with refused():
-            fit_sodium_profile(mean, STAR, START, **known)
+    assert_each_refused(partial(fit_sodium_profile, mean, STAR, START), dark_variance_e2=[-1.0, [1.0, 2.0]])
 
 
 @pytest.mark.parametrize("scale", [1e-6, 1.0, 1e6])
