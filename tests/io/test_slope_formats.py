@@ -173,11 +173,8 @@ class TestEveryFormat:
         begin(path, 8)
         assert_refused(path, "another run", "--overwrite", attributes=OTHER_RUN)
         assert_refused(path, "another run", n_frames=51)
-        assert_refused(path, "already exists", resume=False)
-        assert writer_for(path, resume=False, overwrite=True).finished() == 0
         write(path, result())
         assert_refused(path, "--overwrite", attributes=OTHER_RUN)
-        assert_refused(path, "already exists", "--overwrite", resume=False)
         assert_stored(path, result())
         write(path, CHANGED, overwrite=True)
         assert_alone(path, CHANGED)
@@ -367,7 +364,7 @@ class TestStore:
         with writer_for(path) as writer:
             writer.append(0, part(result(), 0, 20))
             other_run = {"attributes": OTHER_RUN, "overwrite": True}
-            for changes in ({}, other_run, {"overwrite": True, "resume": False}):
+            for changes in ({}, other_run, {"overwrite": True}):
                 assert_refused(path, path.name, f"is being written by process {os.getpid()}", **changes)
             writer.append(20, part(result(), 20, 50))
         assert_alone(path, result())

@@ -133,7 +133,7 @@ class ExistingOutput:
     sizes: tuple[int, int]
     complete: bool
 
-    def may_be_continued(self, path: Path, run: RecordingHeader, *, resume: bool, overwrite: bool) -> bool:
+    def may_be_continued(self, path: Path, run: RecordingHeader, *, overwrite: bool) -> bool:
         """Return whether `run` continues the output (True) or replaces it (False).
 
         Raises
@@ -142,11 +142,11 @@ class ExistingOutput:
             When it may do neither; the message names `path`.
         """
         is_same = self.fingerprint == run.fingerprint and self.sizes == run.sizes
-        if is_same and resume and not (overwrite and self.complete):
+        if is_same and not (overwrite and self.complete):
             return True
         if overwrite:
             return False
-        if is_same or self.fingerprint is None or not resume:
+        if self.fingerprint is None:
             raise InputError(f"{path}: already exists; choose another name or --overwrite")
         raise InputError(
             f"{path}: belongs to another run (other frames or configuration); "

@@ -37,7 +37,6 @@ def create_writer(
     n_subapertures: int,
     attributes: Mapping[str, object],
     coordinates: Mapping[str, NDArray[np.generic]],
-    resume: bool = True,
     overwrite: bool = False,
     measured_attributes: Callable[[], Mapping[str, object]] | None = None,
 ) -> SlopeWriter:
@@ -59,11 +58,9 @@ def create_writer(
         each other's output. Common others: configuration (a TOML text), sources, faintspot_version.
     coordinates : mapping
         Values per sub-aperture, (n_subapertures,) each, such as centre_x and centre_y in px.
-    resume : bool
-        Continue an unfinished output of the same fingerprint; a finished one is then left unchanged.
     overwrite : bool
         Replace a finished output, or another run's: a file when the new one is complete, a .zarr store at
-        once. An unfinished output of the same run is still resumed if `resume` is set.
+        once. An unfinished output of the same run is still resumed.
     measured_attributes : callable, optional
         Returns further attributes; not called if the output is finished already.
 
@@ -95,7 +92,7 @@ def create_writer(
         file_format.require()
         store_path = file_format.store(path)
         export = None if store_path == path else file_format.write
-        is_finished = not overwrite and _is_finished(path, file_format, run, resume=resume)
+        is_finished = not overwrite and _is_finished(path, file_format, run)
         if is_finished and (export is None or not store_path.exists()):
             return SlopeWriter(path, run)
         if measured_attributes is not None:
@@ -114,7 +111,7 @@ def create_writer(
                 return SlopeWriter(path, run)
             if output is not None:
                 output = replace(output, complete=output.complete and export is None)
-                if not output.may_be_continued(store_path, run, resume=resume, overwrite=overwrite):
+                if not output.may_be_continued(store_path, run, overwrite=overwrite):
                     remove_store(store_path)
             return SlopeWriter(path, run, lock, export, SlopeStore(store_path, run))
         except BaseException:
@@ -221,10 +218,10 @@ def _checked_run(
     return RecordingHeader(frames, subapertures, json_values(attributes), values)
 
 
-def _is_finished(path: Path, file_format: FileFormat, run: RecordingHeader, *, resume: bool) -> bool:
+def _is_finished(path: Path, file_format: FileFormat, run: RecordingHeader) -> bool:
     """Return whether this run has completed the output before; refuse another run's output."""
     output = _read(path, file_format.finished)
-    return output is not None and output.may_be_continued(path, run, resume=resume, overwrite=False)
+    return output is not None and output.may_be_continued(path, run, overwrite=False)
 
 
 def read_reference(location: str | Path) -> NDArray[Any]:

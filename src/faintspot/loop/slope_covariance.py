@@ -27,6 +27,9 @@ from faintspot.slopes.spots.shapes import R0_WAVELENGTH_M, structure_function
 Floats = NDArray[np.float64]
 
 ARCSEC = math.pi / 180 / 3600
+OUTER_SCALE_M = 25.0
+"""Outer scale expected before telemetry."""
+_USUAL_R0_M = 0.15
 _SMALLEST, _LARGEST, _NODES = 1e-6, 1e3, 2000  # separations of the table in outer scales
 _DIRECTIONS = 8
 _POINTS = 6  # of the quadrature along half an edge
@@ -69,6 +72,31 @@ class SlopeTurbulence:
     wind_m_per_s: Floats
     averaged: float = 1.0
     length_unit: str = "m"
+
+    @classmethod
+    def unmeasured(
+        cls,
+        cells: NDArray[np.int64],
+        subaperture_m: float,
+        pixel_scale_arcsec: float,
+        outer_scale_m: float | None = None,
+        length_unit: str = "m",
+    ) -> Self:
+        """Return still turbulence of usual strength over sub-apertures, to be measured.
+
+        Parameters
+        ----------
+        cells : (n, 2) array of int
+            Row and column of each sub-aperture.
+        subaperture_m, pixel_scale_arcsec : float
+        outer_scale_m : float, optional
+            Default: that expected before telemetry.
+        length_unit : str
+        """
+        positions = np.asarray(cells[:, ::-1] * subaperture_m, np.float64)
+        outer = outer_scale_m or OUTER_SCALE_M
+        scale, still = pixel_scale_arcsec * ARCSEC, (np.ones(1), np.zeros((1, 2)))
+        return cls(positions, subaperture_m, scale, _USUAL_R0_M, outer, *still, length_unit=length_unit)
 
     def covariance_px2(self, later_s: float = 0.0) -> Floats:
         """Return E[slopes at t + later_s, slopes at t], (2 n, 2 n) px^2: all x, then all y."""

@@ -13,13 +13,13 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.loop.slope_covariance import SlopeTurbulence
+from faintspot.loop.slope_covariance import OUTER_SCALE_M, SlopeTurbulence
 from faintspot.slopes.spots.shapes import R0_WAVELENGTH_M
 
 Floats = NDArray[np.float64]
 
-OUTER_SCALE_M, OUTER_SCALE_SPREAD = 25.0, 0.7
-"""Outer scale expected before telemetry, and the standard deviation of its logarithm."""
+OUTER_SCALE_SPREAD = 0.7
+"""Standard deviation of the logarithm of the outer scale before telemetry."""
 
 _SCALES_M = np.geomspace(4.0, 250.0, 13)
 _FINE_SCALES_M = np.geomspace(4.0, 250.0, 61)

@@ -19,7 +19,6 @@ from faintspot.loop.control.identification.open_loop import noise_variance
 from faintspot.loop.control.reconstructor import make_reconstructor
 from faintspot.loop.slope_covariance import ARCSEC, SlopeTurbulence
 from faintspot.loop.telemetry.recorded_loop import frame_rate
-from faintspot.loop.turbulence_strength import OUTER_SCALE_M
 
 Floats = NDArray[np.float64]
 
@@ -64,12 +63,8 @@ class AlternatingLoop:
     @property
     def site(self) -> SlopeTurbulence:
         """Geometry and outer scale."""
-        positions = np.asarray(self.cells[:, ::-1] * self.subaperture_m, np.float64)
-        scale = self.pixel_scale_arcsec * ARCSEC
-        outer = self.outer_scale_m or OUTER_SCALE_M
-        return SlopeTurbulence(
-            positions, self.subaperture_m, scale, 0.15, outer, np.ones(1), np.zeros((1, 2))
-        )
+        scale = self.pixel_scale_arcsec
+        return SlopeTurbulence.unmeasured(self.cells, self.subaperture_m, scale, self.outer_scale_m)
 
     @cached_property
     def phase(self) -> Floats:

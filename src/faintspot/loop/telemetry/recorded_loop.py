@@ -36,7 +36,7 @@ UNITS = {"px": None, "arcsec": 1.0, "rad": 1 / ARCSEC}
 _OF_AOT = {"pix": "px", "pixel": "px", "px": "px", "arcsec": "arcsec", "rad": "rad"}
 _ARRAYS = ("slopes", "commands", "interaction_matrix", "control_matrix", "cells", "time_s", "frame", "flags")
 _OF_SENSOR = (
-    *("flags", "frame", "cells", "diameter_m", "pixel_scale_arcsec"),
+    *("frame", "cells", "diameter_m", "pixel_scale_arcsec"),
     *("commands", "control_matrix", "frame_rate_hz", "delay_frames"),
 )
 _SCALES = ("pixel_scale_arcsec", "subaperture_m", "diameter_m")

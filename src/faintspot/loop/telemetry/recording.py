@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.base.checks import numbers_between
 from faintspot.base.errors import InputError
 from faintspot.loop.control.base import INTEGRATOR, KALMAN, split_control, without_prior
 from faintspot.loop.control.configuration import Control
 from faintspot.loop.control.identification.open_loop import FEWEST_FRAMES
 from faintspot.loop.control.identification.recording import Recording
 from faintspot.loop.control.options import NONE, STREAM
-from faintspot.loop.slope_covariance import ARCSEC, SlopeTurbulence
-from faintspot.loop.turbulence_strength import OUTER_SCALE_M
+from faintspot.loop.slope_covariance import SlopeTurbulence
 from faintspot.slopes.sensor.layout import Layout
 from faintspot.slopes.sensor.pupil import side_m
 
@@ -101,31 +98,17 @@ def recorded_loop(
     )
 
 
-def site_of(layout: Layout, layers: Sequence[tuple[float, float, float]] = ()) -> SlopeTurbulence:
-    """Return prior knowledge of slopes in turbulence: geometry, outer scale, winds.
-
-    Parameters
-    ----------
-    layout : Layout
-    layers : sequence of (float, float, float)
-        Speed in m/s, direction in degrees from +x (along columns) to +y (along rows), and strength of each,
-        where they are known, of which only the ratios count.
+def site_of(layout: Layout) -> SlopeTurbulence:
+    """Return prior knowledge of slopes in turbulence: geometry and outer scale.
 
     Raises
     ------
     InputError
-        When the layout does not know the size of a sub-aperture, or a value is out of range.
+        When the layout does not know the size of a sub-aperture.
     """
     side = side_m(layout.cells, layout.subaperture_m, layout.diameter_m)
     if side is None:
         raise InputError(
             "layout: expected subaperture_m or diameter_m, which say how fast the wind crosses a sub-aperture"
         )
-    positions = layout.cells[:, ::-1].astype(np.float64) * side
-    scale = (layout.pixel_scale_arcsec or 1.0) * ARCSEC
-    speed, direction, share = np.asarray(layers or [(0.0, 0.0, 1.0)], np.float64).reshape(-1, 3).T
-    numbers_between("layers: speed", speed, 0, 200)
-    numbers_between("layers: direction", direction, -360, 360)
-    numbers_between("layers: strength", share, 0, 1e6, low_open=True)
-    winds = speed * np.array([np.cos(np.deg2rad(direction)), np.sin(np.deg2rad(direction))])
-    return SlopeTurbulence(positions, side, scale, 0.15, OUTER_SCALE_M, share, winds.T)
+    return SlopeTurbulence.unmeasured(layout.cells, side, layout.pixel_scale_arcsec or 1.0)

@@ -22,8 +22,8 @@ from faintspot.loop.control.identification.loop_delay import (
 )
 from faintspot.loop.control.identification.modal_delay import ModalFits, plateau
 from faintspot.loop.control.identification.recording import Recording
-from faintspot.loop.slope_covariance import ARCSEC, SlopeTurbulence
-from faintspot.loop.turbulence_strength import OUTER_SCALE_M, TurbulenceStrength
+from faintspot.loop.slope_covariance import OUTER_SCALE_M, SlopeTurbulence
+from faintspot.loop.turbulence_strength import TurbulenceStrength
 
 Floats = NDArray[np.float64]
 
@@ -59,12 +59,8 @@ class OpenLoop:
 def site_of_loop(loop: Recording) -> SlopeTurbulence:
     """Return the geometry; an unknown pixel scale is 1 arcsec, an unknown sub-aperture the unit of length."""
     unit = "m" if loop.subaperture_m else "sub-apertures"
-    side, scale = loop.subaperture_m or 1.0, (loop.pixel_scale_arcsec or 1.0) * ARCSEC
-    outer = loop.outer_scale_m or OUTER_SCALE_M
-    positions = np.asarray(loop.cells[:, ::-1] * side, np.float64)
-    return SlopeTurbulence(
-        positions, side, scale, 0.15, outer, np.ones(1), np.zeros((1, 2)), length_unit=unit
-    )
+    side, scale = loop.subaperture_m or 1.0, loop.pixel_scale_arcsec or 1.0
+    return SlopeTurbulence.unmeasured(loop.cells, side, scale, loop.outer_scale_m, unit)
 
 
 def runs_of(frame: NDArray[np.int64]) -> NDArray[np.int64]:
