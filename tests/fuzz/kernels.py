@@ -36,8 +36,8 @@ from faintspot.slopes.estimators.centroid import brightest_pixels
 from faintspot.slopes.kernels import parallel
 from faintspot.slopes.kernels.groups import STAGE_ROWS, SlopeArrays, new_scratch
 from faintspot.slopes.kernels.host import WIDTHS
-from faintspot.slopes.pipeline.slope_pipeline import _prior_slopes, kernel_frames
-from faintspot.slopes.pipeline.slopes import RESULT_TYPES, Slopes
+from faintspot.slopes.pipeline.plan import kernel_frames
+from faintspot.slopes.pipeline.slopes import RESULT_TYPES, Slopes, prior_slopes
 from faintspot.slopes.spots.psf import PSF
 
 DTYPES = ("uint16", "float32")
@@ -173,7 +173,7 @@ def _measured(
         variants = plan.variants(flux.mean(axis=1, dtype=np.float64))
     else:
         variants = np.zeros(n_frames, np.int64)
-    predicted = None if prior is None else _prior_slopes(prior, n_frames, pipeline.layout)
+    predicted = None if prior is None else prior_slopes(prior, n_frames, pipeline.layout)
     task = guard(plan.task(variants, predicted))
     results = guard(SlopeArrays(*(np.empty((n_frames, n), kind) for kind in RESULT_TYPES)))
     rows = STAGE_ROWS * int(rng.integers(2))

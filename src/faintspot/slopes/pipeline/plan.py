@@ -54,6 +54,20 @@ def _packed(windows: NDArray[np.generic], width: int) -> NDArray[np.float32]:
     return np.ascontiguousarray(groups, np.float32)
 
 
+KERNEL_TYPES = (np.dtype(np.uint16), np.dtype(np.float32))
+"""Types of the pixels of frames that kernels read."""
+
+
+def kernel_frames(array: NDArray[np.generic]) -> NDArray[np.generic]:
+    """Return frames in the form that kernels read: (n, h, w), contiguous, uint16 or float32."""
+    if array.dtype in KERNEL_TYPES and array.flags.c_contiguous and array.dtype.isnative:
+        return array if array.ndim == 3 else array[None]
+    dtype = np.uint16 if array.dtype == np.uint8 else np.float32
+    with np.errstate(over="ignore"):  # values that overflow float32 become infinite: bad pixels
+        frames = np.ascontiguousarray(array, dtype=dtype)
+    return frames.reshape(-1, *array.shape[-2:])
+
+
 class Plan:
     """Settings of each sub-aperture and tables of the estimator, for each level of flux that occurs.
 

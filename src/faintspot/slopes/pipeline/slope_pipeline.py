@@ -29,16 +29,28 @@ from faintspot.slopes.kernels.parallel import most_threads, run_groups, thread_s
 from faintspot.slopes.kernels.simd import Lanes
 from faintspot.slopes.pipeline import configuration
 from faintspot.slopes.pipeline.light import MeanFlux, MeanLight, light_test
-from faintspot.slopes.pipeline.plan import NO_STAGES, Plan, SmallFrames, packed_calibration
+from faintspot.slopes.pipeline.plan import (
+    KERNEL_TYPES,
+    NO_STAGES,
+    Plan,
+    SmallFrames,
+    kernel_frames,
+    packed_calibration,
+)
 from faintspot.slopes.pipeline.settings import Settings
-from faintspot.slopes.pipeline.slopes import RESULT_TYPES, Slopes, Stages
+from faintspot.slopes.pipeline.slopes import (
+    RESULT_TYPES,
+    Slopes,
+    Stages,
+    prior_slopes,
+    reference_positions,
+)
 from faintspot.slopes.sensor.binning import binned_layout
 from faintspot.slopes.sensor.layout import Layout
 from faintspot.slopes.spots.fixed_weights import FixedWeights
 from faintspot.slopes.spots.psf import PSF
 
-_KERNEL_TYPES = (np.dtype(np.uint16), np.dtype(np.float32))
-_SMALL_TYPES = (np.dtype(np.uint8), *_KERNEL_TYPES)
+_SMALL_TYPES = (np.dtype(np.uint8), *KERNEL_TYPES)
 _FLUX_COST = 0.1  # of summing the pixels of a sub-aperture, in units of `Estimator.cost`
 
 
@@ -101,13 +113,12 @@ class SlopePipeline:
         """Layout in the pixels of binned frames, in which slopes are measured: `layout` if its `bin` is 1."""
         self.settings = Settings(settings) if isinstance(settings, Estimator) else settings
         self.calibration = Calibration() if calibration is None else calibration
-        self.threads = (
-            None if threads is None else int(number_between("threads", threads, 1, 4096, integer=True))
-        )
+        if threads is not None:
+            threads = int(number_between("threads", threads, 1, 4096, integer=True))
+        self.threads = threads
         self._lanes = lanes_for(np.float32, width)
-        self._parts = psf, score, layout.offsets + _reference_positions(reference, layout)
+        self._parts = psf, score, layout.offsets + reference_positions(reference, layout)
         self._prepare()
-        self._identity = _identity(*self._parts)
 
     @classmethod
     def from_file(cls, path: str | Path, **options: Any) -> SlopePipeline:
@@ -130,7 +141,7 @@ class SlopePipeline:
         """Test for sub-apertures without flux."""
         sizes = scratch_size(*self.binned_layout.window), doubtful_scratch_size(len(self.layout))
         self._scratch_size = max(sizes)
-        self._checks = {dtype: _checks(dtype, self.light_test.lanes) for dtype in _KERNEL_TYPES}
+        self._checks = {dtype: _checks(dtype, self.light_test.lanes) for dtype in KERNEL_TYPES}
 
     @property
     def width(self) -> int:
@@ -145,8 +156,12 @@ class SlopePipeline:
         InputError
             If the width is another one.
         """
+        return self._changed(_lanes=lanes_for(np.float32, width))
+
+    def _changed(self, **attributes: object) -> SlopePipeline:
+        """Return a copy with other attributes, whose tables are computed anew."""
         pipeline = copy.copy(self)
-        pipeline._lanes = lanes_for(np.float32, width)
+        vars(pipeline).update(attributes)
         pipeline._prepare()
         return pipeline
 
@@ -171,17 +186,7 @@ class SlopePipeline:
         InputError
             If they do not fit the sensor.
         """
-        psf, score, zero = self._parts
-        return SlopePipeline(
-            self.layout,
-            settings,
-            self.calibration,
-            zero - self.layout.offsets,
-            psf=psf,
-            score=score,
-            width=self.width,
-            threads=self.threads,
-        )
+        return self._changed(settings=settings)
 
     def with_flux(self, mean_flux: MeanFlux | ArrayLike) -> SlopePipeline:
         """Return the same pipeline with the given mean flux of its sub-apertures.
@@ -239,25 +244,19 @@ class SlopePipeline:
         layout, camera = self.layout, self.calibration
         if layout.bin > 1:
             raise InputError(f"layout.bin = {layout.bin}: expected frames, which are binned; images are not")
-        pipeline = copy.copy(self)
-        pipeline.layout = pipeline.binned_layout = Layout.stacked(len(layout), layout.window, layout.offsets)
-        pipeline.calibration = Calibration(
+        noise: object = camera.read_noise_e
+        if self.plan.sensor.has_noise_map:
+            noise = (self.plan.sensor.pixel_noise_e * camera.em_gain).reshape(-1, layout.window[1])
+        stacked = Layout.stacked(len(layout), layout.window, layout.offsets)
+        calibration = Calibration(
             dark=None if camera.dark is None else 0.0,
             estimated=camera.estimated,
             gain_e_per_adu=camera.em_gain,
             em_gain=camera.em_gain,
-            read_noise_e=self._noise_of_images(),
+            read_noise_e=noise,
             background_e=camera.background_e,
         )
-        pipeline._prepare()
-        return pipeline
-
-    def _noise_of_images(self) -> object:
-        """Return the read noise of `for_images`."""
-        if not self.plan.sensor.has_noise_map:
-            return self.calibration.read_noise_e
-        noise = self.plan.sensor.pixel_noise_e * self.calibration.em_gain
-        return noise.reshape(-1, self.layout.window[1])
+        return self._changed(layout=stacked, binned_layout=stacked, calibration=calibration)
 
     @property
     def needs_flux(self) -> bool:
@@ -276,7 +275,9 @@ class SlopePipeline:
             f"{calibration.dark_is_known} {configuration.to_text(self.settings)}"
         )
         return (
-            b"".join(np.ascontiguousarray(part).tobytes() for part in parts) + self._identity + text.encode()
+            b"".join(np.ascontiguousarray(part).tobytes() for part in parts)
+            + _identity(*self._parts)
+            + text.encode()
         )
 
     def __call__(self, frame: ArrayLike, prior: ArrayLike | Slopes | None = None) -> Slopes:
@@ -361,9 +362,7 @@ class SlopePipeline:
             stages = np.empty((STAGE_ROWS, n_frames, n, self.binned_layout.pixels), np.float32)
         source = self.source(frames, dtype)
         variants = self._variants(source)
-        predicted = (
-            None if prior is None else _prior_slopes(prior, n_frames, self.layout) / np.float32(factor)
-        )
+        predicted = None if prior is None else prior_slopes(prior, n_frames, self.layout) / np.float32(factor)
         task = self.plan.task(variants, predicted)
         kernel = self.plan.kernel(frames)
 
@@ -440,55 +439,9 @@ def _checks(dtype: np.dtype[np.generic], lanes: Lanes) -> Direct:
     return Direct(check_slopes)
 
 
-def kernel_frames(array: NDArray[np.generic]) -> NDArray[np.generic]:
-    """Return frames in the form that kernels read: (n, h, w), contiguous, uint16 or float32."""
-    if array.dtype in _KERNEL_TYPES and array.flags.c_contiguous and array.dtype.isnative:
-        return array if array.ndim == 3 else array[None]
-    dtype = np.uint16 if array.dtype == np.uint8 else np.float32
-    with np.errstate(over="ignore"):  # values that overflow float32 become infinite: bad pixels
-        frames = np.ascontiguousarray(array, dtype=dtype)
-    return frames.reshape(-1, *array.shape[-2:])
-
-
-def _reference_positions(reference: ArrayLike | Slopes | None, layout: Layout) -> NDArray[np.float64]:
-    """Return the reference positions as (n, 2)."""
-    n, side = len(layout), max(layout.frame_shape)
-    if reference is None:
-        return np.zeros((n, 2))
-    values = reference.vector if isinstance(reference, Slopes) else reference
-    array = numbers_between("reference", values, -side, side)
-    if array.shape == (2 * n,):
-        return np.stack([array[:n], array[n:]], axis=1)
-    if array.shape != (n, 2):
-        raise InputError(
-            f"expected shape ({n}, 2) or ({2 * n},), as the layout, got {array.shape}; `faintspot wavefront "
-            "--minus` subtracts slopes of another layout",
-            name="reference",
-        )
-    return array
-
-
 def _camera_type(frame: ArrayLike) -> np.dtype[np.generic]:
     """Return the type of the frame's pixels as given: masked integers become floats later."""
     return frame.dtype if isinstance(frame, np.ndarray) else np.asarray(frame).dtype
-
-
-def _prior_slopes(prior: ArrayLike | Slopes, n_frames: int, layout: Layout) -> NDArray[np.float32]:
-    """Return the predicted slopes as the kernel reads them: (1 or n_frames, 2, n).
-
-    Values larger than the frame, as of a diverged loop, are treated as not predicted.
-    """
-    n = len(layout)
-    array = real_array("prior", prior.vector if isinstance(prior, Slopes) else prior)
-    if array.shape in ((n, 2), (n_frames, n, 2)):
-        array = np.moveaxis(array, -1, -2)
-    elif array.shape not in ((2 * n,), (n_frames, 2 * n)):
-        raise InputError(
-            f"prior: expected shape ({n}, 2) or ({2 * n},), or as many for each of the {n_frames} frames, "
-            f"got {array.shape}"
-        )
-    possible = np.abs(array) <= max(layout.frame_shape)
-    return np.ascontiguousarray(np.where(possible, array, 0.0).reshape(-1, 2, n), np.float32)
 
 
 def _identity(psf: PSF | None, score: FixedWeights | None, zero: NDArray[np.float64]) -> bytes:

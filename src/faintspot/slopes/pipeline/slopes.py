@@ -7,9 +7,9 @@ from dataclasses import dataclass, field, fields
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from faintspot.base.checks import one_of
+from faintspot.base.checks import numbers_between, one_of, real_array
 from faintspot.base.errors import InputError, MissingExtraError
 from faintspot.base.flags import NO_FLAG, UNMEASURED, VARIABLES, SubapertureFlag, are_valid, scaled_positions
 from faintspot.io.file_format import COORDINATE_UNITS, UNITS, pixels_in, unit_of
@@ -137,6 +137,39 @@ class Slopes:
         Columns are named as in .csv files, such as x_px. Parameters and errors are those of `to_xarray`.
         """
         return table_of_slopes(self.variables, layout, unit)
+
+
+def reference_positions(reference: ArrayLike | Slopes | None, layout: Layout) -> NDArray[np.float64]:
+    """Return reference positions, given as for `SlopePipeline`, as (n, 2)."""
+    n, side = len(layout), max(layout.frame_shape)
+    if reference is None:
+        return np.zeros((n, 2))
+    values = reference.vector if isinstance(reference, Slopes) else reference
+    hint = "; `faintspot wavefront --minus` subtracts slopes of another layout"
+    array = numbers_between("reference", values, -side, side)
+    return _vectors("reference", array, n, hint=hint)[0].T  # type: ignore[no-any-return]
+
+
+def prior_slopes(prior: ArrayLike | Slopes, n_frames: int, layout: Layout) -> NDArray[np.float32]:
+    """Return predicted slopes, given as for `SlopePipeline`, as the kernel reads them: (1 or n_frames, 2, n).
+
+    Values larger than the frame, as of a diverged loop, are treated as not predicted.
+    """
+    array = real_array("prior", prior.vector if isinstance(prior, Slopes) else prior)
+    vectors = _vectors("prior", array, len(layout), n_frames)
+    possible = np.abs(vectors) <= max(layout.frame_shape)
+    return np.ascontiguousarray(np.where(possible, vectors, 0.0), np.float32)
+
+
+def _vectors(name: str, array: NDArray[Any], n: int, n_frames: int = 0, hint: str = "") -> NDArray[Any]:
+    """Return x and y of n sub-apertures, of all frames or of each, as (1 or n_frames, 2, n)."""
+    if array.shape in ((n, 2), (n_frames, n, 2)):
+        array = np.moveaxis(array, -1, -2)
+    elif array.shape not in ((2 * n,), (n_frames, 2 * n)):
+        each = f", or as many for each of the {n_frames} frames" if n_frames else ""
+        shapes = f"({n}, 2) or ({2 * n},), as the layout{each}"
+        raise InputError(f"expected shape {shapes}, got {array.shape}{hint}", name=name)
+    return array.reshape(-1, 2, n)
 
 
 @dataclass(frozen=True)

@@ -12,8 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from faintspot.base.checks import finite_array, number_between, numbers_between
 from faintspot.base.errors import InputError
-from faintspot.base.files import NpzFile
-from faintspot.slopes.spots.psf import PSF
+from faintspot.slopes.spots.psf import PSF, Indexed
 
 Floats = NDArray[np.float64]
 
@@ -54,7 +53,7 @@ _RIDGE = 1e-6  # of the mean variance of a pixel: keeps the solution finite with
 
 
 @dataclass(frozen=True, eq=False)
-class FixedWeights(NpzFile):
+class FixedWeights(Indexed):
     """Weights of the pixels of a sub-aperture whose sums are its slopes; immutable.
 
     A spot with image g, in fractions of its flux, is at ``sum x (g - mean_spot)`` px from its reference
@@ -85,7 +84,7 @@ class FixedWeights(NpzFile):
     >>> quad_cell = fs.FixedWeights(0.8 * cell, 0.8 * cell.T, np.full((2, 2), 0.25))
     """
 
-    WHAT = "fixed weights"
+    NAME, WHAT = "weights", "fixed weights"
     FIELDS = ("x", "y", "mean_spot", "flux", "index")
     OPTIONAL = ("flux", "index")
 
@@ -97,54 +96,26 @@ class FixedWeights(NpzFile):
 
     def __post_init__(self) -> None:
         values: dict[str, Any] = {}
-        for name in ("x", "y", "mean_spot"):
+        for name in ("x", "y", "mean_spot", "flux"):
+            if name == "flux" and self.flux is None:
+                values["flux"] = _flux_weights(values)
+                continue
             maps = numbers_between(f"weights.{name}", getattr(self, name), -_LARGEST, _LARGEST)
-            values[name] = (maps[None] if maps.ndim == 2 else maps).astype(np.float64)
-        shape = values["x"].shape
-        if len(shape) != 3:
-            raise InputError(f"weights.x: expected shape (n_kinds, ny, nx), got {shape}")
-        for name in ("y", "mean_spot"):
-            if values[name].shape != shape:
-                raise InputError(f"weights.{name}: expected shape {shape} as x, got {values[name].shape}")
-        values["flux"] = _flux_weights(values) if self.flux is None else self._checked_flux(shape)
-        if self.index is not None:
-            kinds = numbers_between("weights.index", self.index, 0, shape[0] - 1, integer=True)
-            if kinds.ndim != 1:
-                raise InputError(f"weights.index: expected shape (n_subapertures,), got {kinds.shape}")
-            values["index"] = kinds.astype(np.int64)
+            maps = maps[None] if maps.ndim == 2 else maps
+            if maps.ndim != 3:
+                raise InputError(f"weights.{name}: expected shape (n_kinds, ny, nx), got {maps.shape}")
+            values[name] = maps.astype(np.float64)
+            if maps.shape != values["x"].shape:
+                raise InputError(f"weights.{name}: expected shape {values['x'].shape} as x, got {maps.shape}")
         for name, array in values.items():
             array.flags.writeable = False
             object.__setattr__(self, name, array)
-
-    def _checked_flux(self, shape: tuple[int, ...]) -> Floats:
-        maps = numbers_between("weights.flux", self.flux, -_LARGEST, _LARGEST).astype(np.float64)
-        maps = maps[None] if maps.ndim == 2 else maps
-        if maps.shape != shape:
-            raise InputError(f"weights.flux: expected shape {shape} as x, got {maps.shape}")
-        return maps
+        self._check_index(len(values["x"]))
 
     @property
     def window(self) -> tuple[int, int]:
         """Height and width of the sub-apertures [px]."""
         return int(self.x.shape[1]), int(self.x.shape[2])
-
-    def kinds(self, n_subapertures: int) -> NDArray[np.int64]:
-        """Return the kind of each of n sub-apertures.
-
-        Raises
-        ------
-        InputError
-            If the weights are for another number.
-        """
-        if self.index is None:
-            return np.zeros(n_subapertures, np.int64)
-        if len(self.index) != n_subapertures:
-            raise InputError(
-                f"weights.index: expected {n_subapertures} numbers, one per sub-aperture, "
-                f"got {len(self.index)}"
-            )
-        kinds: NDArray[np.int64] = self.index
-        return kinds
 
     @classmethod
     def best_linear(

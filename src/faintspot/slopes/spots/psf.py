@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -25,8 +25,43 @@ _BLOCK_PIXELS = 1 << 21
 _LARGEST_FRACTION = 1e6  # of a spot's flux in a pixel: above it, samples cancel each other
 
 
+class Indexed(NpzFile):
+    """Object of several kinds, one of which each sub-aperture has."""
+
+    NAME: ClassVar[str]
+    """Name in errors."""
+    index: Any
+
+    def _check_index(self, n_kinds: int) -> None:
+        """Check the kind of each sub-aperture, if there are any, and make them read-only."""
+        if self.index is None:
+            return
+        index = numbers_between(f"{self.NAME}.index", self.index, 0, n_kinds - 1, integer=True)
+        if index.ndim != 1:
+            raise InputError(f"{self.NAME}.index: expected shape (n_subapertures,), got {index.shape}")
+        index.flags.writeable = False
+        object.__setattr__(self, "index", index)
+
+    def index_of(self, n_subapertures: int) -> NDArray[np.int64]:
+        """Return the index of the kind of each sub-aperture.
+
+        Raises
+        ------
+        InputError
+            If the index is for another number of sub-apertures.
+        """
+        if self.index is None:
+            return np.zeros(n_subapertures, np.int64)
+        if len(self.index) != n_subapertures:
+            raise InputError(
+                f"{self.NAME}.index: expected {n_subapertures} numbers, one per sub-aperture, "
+                f"got {len(self.index)}"
+            )
+        return self.index  # type: ignore[no-any-return]
+
+
 @dataclass(frozen=True, eq=False)
-class PSF(NpzFile):
+class PSF(Indexed):
     """An effective, super-sampled point-spread function, for a whole sensor or for each sub-aperture.
 
     "Effective" means integrated over the pixel (Anderson & King 2000, PASP 112, 1360). The PSF is a cubic
@@ -58,7 +93,7 @@ class PSF(NpzFile):
     [[1.87 1.87]]
     """
 
-    WHAT = "a PSF"
+    NAME, WHAT = "psf", "a PSF"
     FIELDS = ("samples", "oversampling", "index")
 
     samples: Any
@@ -66,45 +101,33 @@ class PSF(NpzFile):
     index: Any = None
 
     def __post_init__(self) -> None:
-        put = object.__setattr__
-        put(
-            self,
-            "oversampling",
-            int(number_between("psf.oversampling", self.oversampling, 1, 64, integer=True)),
-        )
+        oversampling = int(number_between("psf.oversampling", self.oversampling, 1, 64, integer=True))
         samples = numbers_between("psf.samples", self.samples, -LARGEST_FLOAT32, LARGEST_FLOAT32)
         samples = samples[None] if samples.ndim == 2 else samples
-        if (
-            samples.ndim != 3
-            or min(samples.shape[1:]) < 5
-            or any(side % 2 == 0 for side in samples.shape[1:])
-        ):
+        sides = samples.shape[1:]
+        if samples.ndim != 3 or min(sides) < 5 or any(side % 2 == 0 for side in sides):
             raise InputError(
                 f"psf.samples: expected (n_psfs, rows, columns), both odd and at least 5, got {samples.shape}"
             )
         check_size("psf.samples", samples.shape)
-        if max(samples.shape[1:]) > _LONGEST_SIDE:
+        if max(sides) > _LONGEST_SIDE:
             raise InputError(
                 f"psf.samples: expected at most {_LONGEST_SIDE} rows and columns, got {samples.shape}"
             )
         flux = samples.sum(axis=(1, 2), keepdims=True)
         if np.any(flux <= 0):
             raise InputError(f"psf.samples: expected a positive sum, got {flux.min():g}")
-        samples = samples * (self.oversampling**2 / flux)
+        samples = samples * (oversampling**2 / flux)
         if not np.abs(samples).max() <= _LARGEST_FRACTION:
             raise InputError(
                 f"psf.samples: expected up to {_LARGEST_FRACTION:g} times a spot's flux in a pixel, "
                 f"got {np.abs(samples).max():g}"
             )
         samples.flags.writeable = False
-        put(self, "samples", samples)
-        if self.index is not None:
-            index = numbers_between("psf.index", self.index, 0, len(samples) - 1, integer=True)
-            if index.ndim != 1:
-                raise InputError(f"psf.index: expected one number per sub-aperture, got shape {index.shape}")
-            index.flags.writeable = False
-            put(self, "index", index)
-        elif len(samples) > 1:
+        for name, value in (("oversampling", oversampling), ("samples", samples)):
+            object.__setattr__(self, name, value)
+        self._check_index(len(samples))
+        if self.index is None and len(samples) > 1:
             raise InputError(f"psf.index: expected the PSF of each sub-aperture, as there are {len(samples)}")
 
     def __repr__(self) -> str:
@@ -239,22 +262,6 @@ class PSF(NpzFile):
 
         samples = gaussian_filter(self.samples, std, mode="constant", axes=(-2, -1))
         return PSF(samples, self.oversampling, self.index)
-
-    def index_of(self, n_subapertures: int) -> NDArray[np.int64]:
-        """Return the index of the PSF of each sub-aperture.
-
-        Raises
-        ------
-        InputError
-            If the index is for another number of sub-apertures.
-        """
-        if self.index is None:
-            return np.zeros(n_subapertures, np.int64)
-        if len(self.index) != n_subapertures:
-            raise InputError(
-                f"psf.index: expected {n_subapertures} numbers, one per sub-aperture, got {len(self.index)}"
-            )
-        return self.index  # type: ignore[no-any-return]
 
     @cached_property
     def separable_terms(self) -> tuple[Floats, Floats]:

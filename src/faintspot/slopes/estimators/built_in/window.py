@@ -101,7 +101,7 @@ class Window(Estimator):
             if weights.window != sensor.window:
                 wanted, got = (f"{ny} x {nx}" for ny, nx in (sensor.window, weights.window))
                 raise InputError(f"weights: expected windows of {wanted} px as in the layout, got {got}")
-            weights.kinds(sensor.n)
+            weights.index_of(sensor.n)
         else:
             super().check(sensor)
         if self.normalisation == MEAN and np.isnan(sensor.flux_e).any():
@@ -137,7 +137,7 @@ class _WindowPlan(EstimatorPlan):
         gain, region = self.each("centroid_gain"), self._half_regions()
         if np.isnan(gain).all() and region.min() > max(sensor.window):
             return given
-        kinds, gain = given.kinds(sensor.n), np.nan_to_num(gain, nan=1.0)[:, None, None]
+        kinds, gain = given.index_of(sensor.n), np.nan_to_num(gain, nan=1.0)[:, None, None]
         inside = ~_outside(*_offsets(sensor.layout.offsets, sensor.window), region)
         x, y, spot, flux = (maps[kinds] for maps in (given.x, given.y, given.mean_spot, given.flux))
         return FixedWeights(inside * x / gain, inside * y / gain, spot, inside * flux, np.arange(sensor.n))
@@ -209,7 +209,7 @@ class _WindowPlan(EstimatorPlan):
     @cached_property
     def tables(self) -> window.WindowTables | window.RowTables:
         """See `EstimatorPlan`."""
-        sensor, kinds = self.sensor, self.weights.kinds(self.sensor.n)
+        sensor, kinds = self.sensor, self.weights.index_of(self.sensor.n)
         top, left, bottom, right = self._region
         n_groups = -(-sensor.n // sensor.width)
         lanes = np.minimum(np.arange(n_groups * sensor.width), sensor.n - 1)
@@ -227,7 +227,7 @@ class _WindowPlan(EstimatorPlan):
         top, bottom = whole.top, whole.top + whole.rows
         maps = sensor.layout.images(sensor.calibration.maps(sensor.layout.frame_shape))
         dark, scale = maps[:, :, top:bottom, left : left + columns]
-        weights = self._maps[self.weights.kinds(sensor.n), top:bottom, left : left + columns]
+        weights = self._maps[self.weights.index_of(sensor.n), top:bottom, left : left + columns]
         counted = weights.any(axis=-1)
         bad = (counted & ~np.isfinite(scale)).any(axis=(1, 2))
         scale, dark = np.where(counted & ~bad[:, None, None], (scale, dark), 0.0)
@@ -249,7 +249,7 @@ class _WindowPlan(EstimatorPlan):
     def fill(self, table: NDArray[np.float32]) -> None:
         """See `EstimatorPlan`."""
         weights, sensor = self.weights, self.sensor
-        kinds = weights.kinds(sensor.n)
+        kinds = weights.index_of(sensor.n)
         fixed = isinstance(sensor.score, FixedWeights)
         table[window.HOME_X], table[window.HOME_Y] = (sensor.layout.offsets if fixed else sensor.zero).T
         photons = sensor.excess_noise * np.maximum(weights.mean_spot, 0.0)
@@ -266,7 +266,7 @@ class _WindowPlan(EstimatorPlan):
     def fill_flux(self, table: NDArray[np.float32], flux_e: Floats) -> None:
         """See `EstimatorPlan`."""
         weights, how = self.weights, self.estimator.normalisation
-        kinds = weights.kinds(self.sensor.n)
+        kinds = weights.index_of(self.sensor.n)
         offsets = [(maps * weights.mean_spot).sum(axis=(1, 2))[kinds] for maps in (weights.x, weights.y)]
         if how == NONE:
             table[window.DIVISOR], offsets = 1.0, [np.zeros(1), np.zeros(1)]
