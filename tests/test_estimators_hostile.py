@@ -21,6 +21,7 @@ from tests.estimator_cases import (
 )
 from tests.patience import examples
 from tests.refusals import refused
+from tests.slopes.estimators.image_cases import KINDS, MAGNITUDES
 
 import faintspot as fs
 from faintspot.slopes.estimators import estimators
@@ -35,35 +36,14 @@ FITTED = ("ml", "map")
 
 
 def hostile_images(rng: np.random.Generator, shape: tuple[int, ...]) -> NDArray[np.float32]:
-    """One kind of trouble for each image."""
-    _, ny, nx = shape
-    hot = np.zeros((ny, nx), np.float32)
-    hot[rng.integers(ny), rng.integers(nx)] = 1e6
-    chequered = np.indices((ny, nx)).sum(axis=0) % 2
-    noise = rng.normal(0.0, 1.0, (ny, nx))
-    kinds = [
-        np.zeros((ny, nx)),
-        np.full((ny, nx), 7.0),
-        np.full((ny, nx), -7.0),
-        -np.abs(noise),
-        1e3 * noise,
-        1e-30 * np.abs(noise),
-        1e30 * noise,
-        3e38 * np.clip(noise, -1, 1),
-        hot,
-        -hot,
-        1e4 * chequered,
-        np.where(chequered, np.nan, 5.0),
-        np.full((ny, nx), np.nan),
-        np.full((ny, nx), np.inf),
-        np.where(rng.random((ny, nx)) < 0.2, -np.inf, noise),
-        np.where(np.arange(nx) == 0, 1e4, 0.0) * np.ones((ny, 1)),
-        100 * noise + 1e6,
-        1e29 + 1e25 * noise,
-    ]
-    chosen = rng.integers(0, len(kinds), shape[0])
+    """One kind of trouble for each image, in any unit; some pixels, or all, are not finite."""
+    n, window = shape[0], (shape[1], shape[2])
+    units = rng.choice([*MAGNITUDES, 1e-30, 1e30, 3e38], (n, 1, 1)) * rng.choice([1, 1, -1], (n, 1, 1))
+    images = units * [KINDS[kind](rng, window) for kind in rng.choice(list(KINDS), n)]
+    part = rng.choice([0.0, 0.0, 0.2, 0.5, 1.0], (n, 1, 1))
+    bad = rng.choice([np.nan, np.inf, -np.inf], (n, 1, 1))
     with np.errstate(over="ignore"):
-        return np.stack([kinds[kind] for kind in chosen]).astype(np.float32)
+        return np.where(rng.random(shape) < part, bad, images).astype(np.float32)
 
 
 def flat_case(estimator: str, images: NDArray[Any], **changes: Any) -> Case:

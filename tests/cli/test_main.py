@@ -54,10 +54,7 @@ def test_what_is_unknown(run: Commands, arguments: list[str], naming: tuple[str,
 
 @pytest.mark.parametrize(
     ("error", "code", "text"),
-    [
-        (MemoryError(), 2, "faintspot: error: not enough memory"),
-        (KeyboardInterrupt(), 130, "faintspot: interrupted"),
-    ],
+    [(MemoryError(), 2, "error: not enough memory"), (KeyboardInterrupt(), 130, "interrupted")],
 )
 def test_what_ends_a_command(
     folder: Path, run: Commands, error: BaseException, code: int, text: str, monkeypatch: pytest.MonkeyPatch
@@ -71,7 +68,7 @@ def test_what_ends_a_command(
     (folder / "a.npy").touch()
     result = run("slopes", "a.npy")
     assert result.code == code
-    assert result.error.startswith(text)
+    assert result.error.startswith(f"faintspot: {text}")
 
 
 def test_help_is_in_sections_with_defaults(run: Commands) -> None:

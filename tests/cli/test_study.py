@@ -125,10 +125,8 @@ def test_list_and_show(run: Commands) -> None:
 
 
 def test_magnitude_writes_a_page_that_report_makes_again(run: Commands) -> None:
-    result = run(
-        "loop", "magnitude", "small.toml", "--quick", "--workers", 0, "--methods", "brightest", "-o", "here"
-    )
-    assert result.code == 0, result.err
+    given = ("--quick", "--workers", 0, "--methods", "brightest", "-o", "here")
+    result = run.ok("loop", "magnitude", "small.toml", *given)
     assert result.out.splitlines()[1].startswith("brightest pixels")
     assert result.out.splitlines()[-1] == "here/report.html: open it in a browser"
     assert "brightest pixels" in Path("here/report.html").read_text(encoding="utf-8")
@@ -141,8 +139,7 @@ def test_night_says_its_verdict_and_repeats_nothing(run: Commands, monkeypatch: 
     short = NightPlan(30, 10, 0, (2, 2), (1.0, 0.75), (2, 2), keep_brightest=12)
     monkeypatch.setattr(protocol, "QUICK_PLAN", short)
     arguments = "loop", "night", "small.toml", "--quick", "--workers", 0
-    result = run(*arguments, "--methods", "none,tv,smoothed", "--strengths", "0.7,1.5")
-    assert result.code == 0, result.err
+    result = run.ok(*arguments, "--methods", "none,tv,smoothed", "--strengths", "0.7,1.5")
     lines = result.out.splitlines()
     assert lines[0].startswith("TV raises the mean Strehl ratio")
     assert lines[-1] == "small-night-quick/night.html: open it in a browser"
@@ -151,13 +148,9 @@ def test_night_says_its_verdict_and_repeats_nothing(run: Commands, monkeypatch: 
     assert json.loads(Path("small-night-quick/night.json").read_text(encoding="utf-8"))["verdicts"]
     again = run(*arguments, "--methods", "none,tv,smoothed", "--strengths", "0.7,1.5")
     assert again.out == result.out  # nothing was done again
-    other = run(*arguments, "--strengths", "0.7")
-    assert other.code != 0
-    assert "--overwrite" in other.err
-    for option, words in (("--strengths", "expected numbers"), ("--methods", "two or more")):
-        refused = run(*arguments, option, "x")
-        assert refused.code != 0
-        assert words in refused.err
+    assert "--overwrite" in run(*arguments, "--strengths", "0.7").err
+    run.refused(*arguments, "--strengths", "x", naming=("expected numbers",))
+    run.refused(*arguments, "--methods", "x", naming=("two or more",))
 
 
 def test_options_of_a_night_are_passed_on(run: Commands, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -221,6 +214,4 @@ def test_engine_files_close_the_loop(run: Commands) -> None:
     ],
 )
 def test_errors_are_one_line(run: Commands, arguments: list[str], message: str) -> None:
-    result = run("loop", *arguments)
-    assert result.code == 2
-    assert message in result.error
+    run.refused("loop", *arguments, naming=(message,))

@@ -86,9 +86,10 @@ class Sensor:
     ) -> None:
         self.rng = rng = np.random.default_rng(seed)
         self.size = size = int((lenslets + 3) * pitch_px)
-        self.pitch_px = pitch_px
+        self.pitch_px, self.geometry, self.lenslets = pitch_px, geometry, lenslets
         drawn_deg = rng.uniform(-20, 20)
-        step = pitch_px * np.exp(1j * np.radians(drawn_deg if angle_deg is None else angle_deg))
+        self.angle_deg = drawn_deg if angle_deg is None else angle_deg
+        step = pitch_px * np.exp(1j * np.radians(self.angle_deg))
         count = np.arange(-2 * lenslets, 2 * lenslets + 1)
         grid = count + count[:, None] * RATIOS[geometry]
         offset = step * (grid.ravel() + rng.uniform(-0.5, 0.5) + 1j * rng.uniform(-0.5, 0.5))
@@ -136,3 +137,16 @@ class Sensor:
     def _distances(self, grid: LensletGrid) -> NDArray[np.float64]:
         found = grid.centres @ [1, 1j]
         return np.asarray(np.abs(found[:, None] - self.nodes[self.illuminated]) / self.pitch_px)
+
+
+def check_regular(grid: LensletGrid) -> None:
+    """The centres are the lattice that the pitch, the angle and the cells say."""
+    step = grid.pitch_px * np.exp(1j * np.radians(grid.angle_deg))
+    nodes = step * (grid.cells[:, 1] + grid.cells[:, 0] * RATIOS[grid.geometry])
+    origin = grid.centres[:, 0] + 1j * grid.centres[:, 1] - nodes
+    np.testing.assert_allclose(origin, origin[0], atol=1e-6)
+    assert grid.cells.min(axis=0).tolist() == [0, 0]
+    assert np.array_equal(np.lexsort((grid.cells[:, 1], grid.cells[:, 0])), np.arange(len(grid.cells)))
+    half_turn = 45 if grid.geometry == "square" else 30
+    assert -half_turn <= grid.angle_deg < half_turn
+    assert len(grid.flux) == len(grid.centres) == len(grid.cells)

@@ -19,12 +19,6 @@ TABLE = {
     9: np.sqrt(8) * R**3 * np.sin(3 * ANGLE),
     10: np.sqrt(8) * R**3 * np.cos(3 * ANGLE),
     11: np.sqrt(5) * (6 * R**4 - 6 * R**2 + 1),
-    12: np.sqrt(10) * (4 * R**4 - 3 * R**2) * np.cos(2 * ANGLE),
-    13: np.sqrt(10) * (4 * R**4 - 3 * R**2) * np.sin(2 * ANGLE),
-    14: np.sqrt(10) * R**4 * np.cos(4 * ANGLE),
-    15: np.sqrt(10) * R**4 * np.sin(4 * ANGLE),
-    16: np.sqrt(12) * (10 * R**5 - 12 * R**3 + 3 * R) * np.cos(ANGLE),
-    17: np.sqrt(12) * (10 * R**5 - 12 * R**3 + 3 * R) * np.sin(ANGLE),
     22: np.sqrt(7) * (20 * R**6 - 30 * R**4 + 12 * R**2 - 1),
 }
 

@@ -6,9 +6,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from tests.refusals import refused
-from tests.slopes.sensor.sensor_cases import Sensor
+from tests.slopes.sensor.sensor_cases import Sensor, check_regular
 
 from faintspot.slopes.sensor.detection.lenslets import find_lenslets
+
+SIZES = [(4, 16, 10), (6, 24, -70), (10, 8, 3), (10, 40, 44.5), (14, 22, -17), (20, 12, 29.5), (40, 8, 61)]
+WIDTHS = [(30, 5.2, 0.15), (12, 8.0, 0.2), (4, 100.0, 0.02), (4, 60.0, 0.2), (5, 33.0, 0.05)]
 
 
 @pytest.mark.parametrize(
@@ -30,15 +33,40 @@ from faintspot.slopes.sensor.detection.lenslets import find_lenslets
         {"outside": 0.1},
         {"outside": 0.1, "scatter": 0.4},
         {"outside": 0.2, "lenslets": 15},
+        *(
+            {"geometry": geometry, "lenslets": n, "pitch_px": pitch_px, "angle_deg": angle_deg}
+            | {"inner": 0.3 if n > 6 else 0.0, "width": 0.09, "flux_e": 8.0 * pitch_px**2}
+            | {"hot_pixels": n**2 // 4}
+            for geometry in ("square", "hexagonal")
+            for n, pitch_px, angle_deg in SIZES
+        ),
+        *(
+            {"geometry": geometry, "lenslets": n, "pitch_px": pitch_px, "width": width, "angle_deg": 4.0}
+            | {"inner": 0.0, "flux_e": 3000.0 * max(width * pitch_px, 0.8), "scatter": 0.0}
+            for geometry in ("square", "hexagonal")
+            for n, pitch_px, width in WIDTHS
+        ),
     ],
     ids=lambda sensor: ", ".join(f"{name} {value}" for name, value in sensor.items()) or "plain",
 )
-def test_pupil_is_found_whole(sensor: dict[str, Any]) -> None:
+def test_lattice_and_pupil_are_found(sensor: dict[str, Any]) -> None:
     """One lenslet in fifty may fall either way: a dim or displaced one at the pupil's edge."""
     truth = Sensor(1, **sensor)
-    missing, false = truth.wrong(find_lenslets(truth.frame()))
-    assert missing <= max(1, 0.02 * np.count_nonzero(truth.illuminated))
-    assert false <= max(1, 0.02 * np.count_nonzero(truth.illuminated))
+    grid = find_lenslets(truth.frame())
+    check_regular(grid)
+    assert (grid.geometry, grid.doubt) == (truth.geometry, "")
+    # The spots are displaced by 0.06 pitch rms per axis. The fit's pitch has an error of
+    # 0.06 / sqrt(sum |node|^2), the sum over n nodes being about n * lenslets^2 / 6 (or more). Four
+    # standard errors are allowed for: less than 0.5 % from 14 lenslets on.
+    count = np.count_nonzero(truth.illuminated)
+    tolerance = max(4 * 0.06 * np.sqrt(6 / count) / truth.lenslets, 0.001)
+    assert grid.pitch_px == pytest.approx(truth.pitch_px, rel=tolerance)
+    turn = 90 if truth.geometry == "square" else 60
+    turned = (grid.angle_deg - truth.angle_deg + turn / 2) % turn - turn / 2
+    assert abs(np.radians(turned)) < tolerance
+    # Four parameters are fitted to 2 n coordinates: rms error 0.06 * sqrt(4 / n) per node, 3 % at n = 12.
+    assert np.sqrt(np.mean(truth.errors(grid) ** 2)) < max(2 * 0.06 * np.sqrt(4 / count), 0.02)
+    assert max(truth.wrong(grid)) <= max(1, 0.02 * count)
 
 
 @pytest.mark.parametrize("part", [0.2, 0.25, 0.3, 0.4])
@@ -73,8 +101,7 @@ def test_ghosts_are_left_out(seed: int) -> None:
     assert false == 0
 
 
-def test_faint_spots_are_doubtful_and_bright_ones_are_not() -> None:
-    assert find_lenslets(Sensor(1).frame()).doubt == ""
+def test_faint_spots_are_doubtful() -> None:
     faint = Sensor(1, lenslets=16, flux_e=100.0)
     grid = find_lenslets(faint.frame())
     assert grid.doubt

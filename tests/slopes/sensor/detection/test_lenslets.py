@@ -6,52 +6,10 @@ import pytest
 from numpy.typing import NDArray
 from tests.refusals import refused
 from tests.shared_data import shared_file
-from tests.slopes.sensor.sensor_cases import RATIOS, Sensor, spot_frame
+from tests.slopes.sensor.sensor_cases import Sensor, check_regular, spot_frame
 
 from faintspot.base.errors import InputError
-from faintspot.slopes.sensor.detection.lenslets import LensletGrid, find_lenslets
-
-
-def check_regular(grid: LensletGrid) -> None:
-    """The centres are the lattice that the pitch, the angle and the cells say."""
-    step = grid.pitch_px * np.exp(1j * np.radians(grid.angle_deg))
-    nodes = step * (grid.cells[:, 1] + grid.cells[:, 0] * RATIOS[grid.geometry])
-    origin = grid.centres[:, 0] + 1j * grid.centres[:, 1] - nodes
-    np.testing.assert_allclose(origin, origin[0], atol=1e-6)
-    assert grid.cells.min(axis=0).tolist() == [0, 0]
-    assert np.array_equal(np.lexsort((grid.cells[:, 1], grid.cells[:, 0])), np.arange(len(grid.cells)))
-    half_turn = 45 if grid.geometry == "square" else 30
-    assert -half_turn <= grid.angle_deg < half_turn
-    assert len(grid.flux) == len(grid.centres) == len(grid.cells)
-
-
-@pytest.mark.parametrize("geometry", ["square", "hexagonal"])
-@pytest.mark.parametrize(
-    ("lenslets", "pitch_px", "angle_deg"),
-    [(4, 16, 10), (6, 24, -70), (10, 8, 3), (10, 40, 44.5), (14, 22, -17), (20, 12, 29.5), (40, 8, 61)],
-)
-def test_simulated_grid_is_found(geometry: str, lenslets: int, pitch_px: float, angle_deg: float) -> None:
-    inner = 0.3 if lenslets > 6 else 0.0
-    shape: dict[str, Any] = {"geometry": geometry, "lenslets": lenslets, "pitch_px": pitch_px, "inner": inner}
-    flux_e, hot_pixels = 8.0 * pitch_px**2, lenslets**2 // 4
-    truth = Sensor(1, **shape, angle_deg=angle_deg, width=0.09, flux_e=flux_e, hot_pixels=hot_pixels)
-    grid = find_lenslets(truth.frame())
-    check_regular(grid)
-    assert grid.geometry == geometry
-    # The spots are displaced by 0.06 pitch rms per axis. The fit's pitch has an error of
-    # 0.06 / sqrt(sum |node|^2), the sum over n nodes being about n * lenslets^2 / 6 (or more). Three
-    # standard errors are allowed for: less than 0.5 % from 14 lenslets on.
-    count = np.count_nonzero(truth.illuminated)
-    tolerance = max(3 * 0.06 * np.sqrt(6 / count) / lenslets, 0.001)
-    assert grid.pitch_px == pytest.approx(pitch_px, rel=tolerance)
-    turn = 90 if geometry == "square" else 60
-    turned = (grid.angle_deg - angle_deg + turn / 2) % turn - turn / 2
-    assert abs(np.radians(turned)) < tolerance
-    # Four parameters are fitted to 2 n coordinates: rms error 0.06 * sqrt(4 / n) per node, 3 % at n = 12.
-    assert np.sqrt(np.mean(truth.errors(grid) ** 2)) < max(2 * 0.06 * np.sqrt(4 / count), 0.02)
-    missing, false = truth.wrong(grid)
-    assert missing <= 0.01 * count
-    assert false <= 2
+from faintspot.slopes.sensor.detection.lenslets import find_lenslets
 
 
 @pytest.mark.parametrize("geometry", ["square", "hexagonal"])
