@@ -8,6 +8,7 @@ from uuid import uuid4
 import numpy as np
 import pytest
 from tests.adapters.adapter_cases import needs
+from tests.engine.commands import needs_shared_memory
 from tests.patience import wait_for
 from tests.shared_data import ROOT
 
@@ -15,12 +16,11 @@ import faintspot as fs
 from faintspot import InputError, Settings
 from faintspot.adapters import pyrtc
 from faintspot.adapters.pyrtc import _Frames, _Measuring
-from faintspot.engine.segment import FOLDER
 
 SHAPE = (6, 5)
 FILES = ROOT / "examples" / "pyrtc"
 pyshmem = pytest.importorskip("pyshmem")
-pytestmark = pytest.mark.skipif(not FOLDER.is_dir(), reason="needs POSIX shared memory as Linux has it")
+pytestmark = needs_shared_memory
 
 
 @pytest.fixture

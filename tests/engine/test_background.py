@@ -23,7 +23,6 @@ from faintspot.loop.control.identification.model import Kalman
 from faintspot.loop.control.integrator import LoopPlant
 from faintspot.loop.control.options import ControlOptions
 from faintspot.slopes.pipeline import configuration as configuration_file
-from faintspot.slopes.pipeline.settings import Settings
 from faintspot.slopes.pipeline.slopes import RESULT_TYPES, Slopes
 from faintspot.slopes.sensor.layout import Layout
 
@@ -76,8 +75,14 @@ class Run:
         return np.array(sent)
 
 
-def engine_of(run: Run) -> Any:
-    return SimpleNamespace(loop=run.loop, learning=None, estimators=None)
+def configured(folder: Path, model: Kalman) -> Path:
+    """Write the configuration of an engine with a filter; return its path."""
+    path = folder / "faintspot.toml"
+    configuration_file.save(path, LAYOUT)
+    np.save(folder / "m.npy", INTERACTION)
+    model.save(folder / "model.npz")
+    save_control(path, interaction_matrix="m.npy", controller="kalman", model="model.npz")
+    return path
 
 
 @pytest.mark.slow  # compiles kernels of filters for itself
@@ -144,17 +149,13 @@ def test_a_better_filter_is_handed_to_the_engine(
 
     monkeypatch.setattr("faintspot.engine.background.relearn", relearnt)
     monkeypatch.setattr("faintspot.engine.background.FEWEST_FRAMES", 90)
-    path = tmp_path / "faintspot.toml"
-    configuration_file.save(path, LAYOUT)
-    configuration_file.save(path, Settings("brightest"))
-    np.save(tmp_path / "m.npy", INTERACTION)
-    outdated(model).save(tmp_path / "model.npz")
-    save_control(path, interaction_matrix="m.npy")
+    path = configured(tmp_path, outdated(model))
+    save_control(path, controller="integrator")
     with pytest.raises(InputError, match="expected controller"):
         BackgroundLearning(name, path, 1.0)
-    save_control(path, controller="kalman", model="model.npz")
+    save_control(path, controller="kalman")
     run = Run(name, outdated(model))
-    engine = engine_of(run)
+    engine: Any = SimpleNamespace(loop=run.loop, learning=None, estimators=None)
     handlers = {
         "learnt": commands_of(engine)["learnt"],
         "get": lambda _: {"settings": {"estimator": "window"}},
@@ -196,13 +197,8 @@ def test_it_never_learns_across_records_that_were_lost(
 ) -> None:
     """Frames before and after a gap are no time series: what waits is forgotten, and it begins anew."""
     monkeypatch.setattr("faintspot.engine.background.FEWEST_FRAMES", 90)
-    path = tmp_path / "faintspot.toml"
-    configuration_file.save(path, LAYOUT)
-    np.save(tmp_path / "m.npy", INTERACTION)
-    model.save(tmp_path / "model.npz")
-    save_control(path, interaction_matrix="m.npy", controller="kalman", model="model.npz")
     run = Run(name, model, records=150)
-    learning = BackgroundLearning(name, path, 180 * FRAME_S)
+    learning = BackgroundLearning(name, configured(tmp_path, model), 180 * FRAME_S)
     run.frames(120)
     assert not learning.take()
     run.frames(200)  # more than the ring holds

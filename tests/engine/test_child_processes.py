@@ -1,12 +1,11 @@
 """Processes that end with the one that has started them."""
 
 import signal
-import subprocess
-import sys
 from pathlib import Path
 from uuid import uuid4
 
 import pytest
+from tests.engine.commands import start
 from tests.patience import LIMIT_S, wait_for
 
 from faintspot.base.errors import InputError
@@ -39,8 +38,7 @@ def lives(pid: int) -> bool:
 
 
 def test_they_end_where_this_one_is_killed(tmp_path: Path) -> None:
-    command = [sys.executable, "-c", PARENT, str(tmp_path), f"fs_test_{uuid4().hex[:12]}"]
-    parent = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    parent = start(PARENT, str(tmp_path), f"fs_test_{uuid4().hex[:12]}")
     assert parent.stdout is not None
     child = int(parent.stdout.readline())
     assert lives(child)

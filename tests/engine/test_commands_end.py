@@ -5,17 +5,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tests.engine.commands import start
+from tests.engine.commands import needs_shared_memory, start
 from tests.patience import LIMIT_S, wait_for
 
 from faintspot.engine.pixel_ring import PixelRing
 from faintspot.engine.segment import FOLDER
 
 pyshmem = pytest.importorskip("pyshmem")
-pytestmark = [
-    pytest.mark.skipif(not FOLDER.is_dir(), reason="needs POSIX shared memory as Linux has it"),
-    pytest.mark.slow,
-]
+pytestmark = [needs_shared_memory, pytest.mark.slow]
 
 
 @pytest.mark.parametrize(

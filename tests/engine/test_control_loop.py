@@ -94,13 +94,17 @@ def controls(draw: Any) -> Control:
     return made(scaled(draw, INTERACTION), None, ControlOptions(**options), model)
 
 
+def no_slopes() -> Slopes:
+    return Slopes(*(np.zeros(N, kind) for kind in RESULT_TYPES))
+
+
 @st.composite
 def frames(draw: Any) -> list[Slopes]:
     """Return slopes as estimators give them, with numbers as large as float32 holds and flags at random."""
     rng = np.random.default_rng(draw(st.integers(0, 99)))
     made = []
     for _ in range(FRAMES):
-        slopes = Slopes(*(np.zeros(N, kind) for kind in RESULT_TYPES))
+        slopes = no_slopes()
         size = draw(st.sampled_from([1.0, 1.0, 0.0, 1e-30, 1e4, 1e38]))
         for array in (slopes.x, slopes.y):
             array[:] = size * rng.uniform(-1, 1, N)
@@ -141,7 +145,7 @@ def test_a_command_that_is_begun_while_rows_arrive_is_the_same(monkeypatch: pyte
     assert not begun.begin_product()
     rng = np.random.default_rng(4)
     for number in (0, 1, 2, 5, 6, 7):
-        slopes = Slopes(*(np.zeros(N, kind) for kind in RESULT_TYPES))
+        slopes = no_slopes()
         slopes.x[:], slopes.y[:] = rng.standard_normal((2, N))
         slopes.x[number % N] = np.nan
         parts = begun.begin_product()
@@ -159,20 +163,27 @@ def test_a_command_that_is_begun_while_rows_arrive_is_the_same(monkeypatch: pyte
 
 
 def frame_of(rng: np.random.Generator) -> Slopes:
-    slopes = Slopes(*(np.zeros(N, kind) for kind in RESULT_TYPES))
+    slopes = no_slopes()
     slopes.x[:], slopes.y[:] = 0.1 * rng.standard_normal((2, N))
     return slopes
 
 
-def test_commands_are_minus_the_gain_times_the_wavefront_of_true_slopes() -> None:
-    options = ControlOptions(gain=0.3, leak=0.02, centroid_gain=0.5, largest_residual_px=1e30)
-    control = Control(INTERACTION, None, options)
-    loop, rng, expected = ControlLoop(control, LAYOUT), np.random.default_rng(5), np.zeros(COMMANDS)
+def closed(**options: Any) -> ControlLoop:
+    """Return a closed loop whose guard tolerates any slopes."""
+    loop = ControlLoop(
+        Control(INTERACTION, None, ControlOptions(largest_residual_px=1e30, **options)), LAYOUT
+    )
     loop.close()
+    return loop
+
+
+def test_commands_are_minus_the_gain_times_the_wavefront_of_true_slopes() -> None:
+    loop, rng = closed(gain=0.3, leak=0.02, centroid_gain=0.5), np.random.default_rng(5)
+    expected = np.zeros(COMMANDS)
     for number in range(3):
         slopes = frame_of(rng)
         measured = np.concatenate([slopes.x, slopes.y]) / 0.5
-        expected = 0.98 * expected - 0.3 * control.reconstructor.matrix @ measured
+        expected = 0.98 * expected - 0.3 * loop.control.reconstructor.matrix @ measured
         np.testing.assert_allclose(loop.follow(slopes, number), expected, atol=1e-5)
         loop.look_after(slopes.flux)
         rms = np.sqrt(np.mean(measured**2))
@@ -184,9 +195,7 @@ def test_commands_act_after_their_delay_also_if_frames_are_lost(
     lost: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The mirror moves on in lost frames, for which there was no other command."""
-    options = ControlOptions(delay_frames=3, largest_residual_px=1e30)
-    loop, rng = ControlLoop(Control(INTERACTION, None, options), LAYOUT), np.random.default_rng(6)
-    loop.close()
+    loop, rng = closed(delay_frames=3), np.random.default_rng(6)
     sent: list[np.ndarray] = []
     seen: list[np.ndarray] = []
     update = loop.controller.update
@@ -207,9 +216,7 @@ def test_commands_act_after_their_delay_also_if_frames_are_lost(
 
 
 def test_a_new_controller_follows_slopes_divided_by_its_own_centroid_gain() -> None:
-    options = ControlOptions(centroid_gain=0.5, largest_residual_px=1e30)
-    loop, rng = ControlLoop(Control(INTERACTION, None, options), LAYOUT), np.random.default_rng(7)
-    loop.close()
+    loop, rng = closed(centroid_gain=0.5), np.random.default_rng(7)
     taken: list[Any] = []
     new: Any = SimpleNamespace(is_settling=True, ready=SimpleNamespace(centroid_gain=0.4))
     new.follow = lambda _, *frame: taken.append([None if part is None else part.copy() for part in frame])
@@ -229,21 +236,16 @@ def test_a_new_controller_follows_slopes_divided_by_its_own_centroid_gain() -> N
 
 def test_no_command_is_begun_if_modes_are_removed_from_slopes(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(integrator, "_LEAST_BYTES", 0)
-    options = ControlOptions(removed_modes="tip_tilt", largest_residual_px=1e30)
-    loop = ControlLoop(Control(INTERACTION, None, options), LAYOUT)
-    loop.close()
-    slopes = Slopes(*(np.zeros(N, kind) for kind in RESULT_TYPES))
-    loop.follow(slopes, 0)
+    loop = closed(removed_modes="tip_tilt")
+    loop.follow(no_slopes(), 0)
     assert loop.closed
     assert not loop.begin_product()
 
 
 def test_a_controller_that_cannot_begin_opens_the_loop(monkeypatch: pytest.MonkeyPatch) -> None:
     """Nothing raises in the frame path."""
-    loop = ControlLoop(Control(INTERACTION, None, ControlOptions(largest_residual_px=1e30)), LAYOUT)
-    loop.close()
-    slopes = Slopes(*(np.zeros(N, kind) for kind in RESULT_TYPES))
-    loop.follow(slopes, 0)
+    loop = closed()
+    loop.follow(no_slopes(), 0)
 
     def fail(*_: Any) -> None:
         raise ArithmeticError("no product")
@@ -252,7 +254,7 @@ def test_a_controller_that_cannot_begin_opens_the_loop(monkeypatch: pytest.Monke
     assert not loop.begin_product()
     assert not loop.closed
     assert "no product" in loop.opened_because
-    assert np.isfinite(loop.follow(slopes, 1)).all()
+    assert np.isfinite(loop.follow(no_slopes(), 1)).all()
 
 
 def run(loop: ControlLoop, stroke: float, taken: list[Slopes]) -> str:

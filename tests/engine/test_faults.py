@@ -2,8 +2,6 @@
 
 import os
 import signal
-import subprocess
-import sys
 import threading
 import time
 from typing import Any
@@ -11,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from tests.engine.bench import SETTINGS, Bench, make, simulated
+from tests.engine.commands import start
 
 from faintspot.engine.segment import FOLDER
 from faintspot.engine.timing import CAUSES, INCOMPLETE
@@ -140,8 +139,7 @@ def test_a_consumer_that_hangs(bench: Bench) -> None:
         f"import pyshmem\ns = pyshmem.open('{bench.name}_slopes')\nprint('ready', flush=True)\n"
         "while True: s.count and s.read_publication()"
     )
-    command = [sys.executable, "-c", program]
-    with bench.ring() as ring, subprocess.Popen(command, stdout=subprocess.PIPE) as consumer:
+    with bench.ring() as ring, start(program) as consumer:
         assert consumer.stdout is not None
         consumer.stdout.readline()
         bench.attached()

@@ -151,7 +151,8 @@ def test_a_product_with_the_slopes_is_begun_while_rows_arrive(
             np.testing.assert_allclose(product(vector), vector @ columns, atol=1e-5)  # of float32
 
 
-def test_frames_that_are_there_are_measured_before_any_product(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_product_is_begun_of_frames_that_are_there_or_never_come(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of the latter, the slopes of the frame before are still there."""
     monkeypatch.setattr(integrator, "_LEAST_BYTES", 0)
     data, source = frames(1), Source()
     source.write(0, data[0])
@@ -163,16 +164,6 @@ def test_frames_that_are_there_are_measured_before_any_product(monkeypatch: pyte
     assert not product.memory.taken.any()
     path.flag_doubtful()
     assert_same(path.slopes, pipeline("plain")(data), 0)
-
-
-def test_nothing_is_begun_of_a_frame_that_never_came(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The slopes of the frame before are still there."""
-    monkeypatch.setattr(integrator, "_LEAST_BYTES", 0)
-    data, source = frames(1), Source()
-    source.write(0, data[0])
-    product = SlopeProduct(np.ones((20, 2 * len(LAYOUT))))
-    path = FramePath(pipeline("plain"), source.slots, source.progress)
-    assert path.measure(0)
     assert path.slopes.vector.any()
     path.stop()
     assert not path.measure(1, product=product.parts(1, 1.0))

@@ -20,15 +20,10 @@ from faintspot.loop.control.configuration import Control
 pytest.importorskip("hcipy")
 pyshmem = pytest.importorskip("pyshmem")
 
-from tests.engine.closed_loop import COMMANDS, PATIENCE_S, Sky, configured, make_engine  # noqa: E402
+from tests.engine.closed_loop import COMMANDS, PATIENCE_S, Sky, make_engine  # noqa: E402
 from tests.patience import wait_for  # noqa: E402
 
 pytestmark = pytest.mark.slow
-
-
-@pytest.fixture(scope="module")
-def files(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Control]:
-    return configured(tmp_path_factory.mktemp("bench"))
 
 
 @pytest.fixture
@@ -161,12 +156,6 @@ def mounts(folder: Path) -> bool:
         return False
     tried = subprocess.run([*UNSHARE, *TMPFS, str(folder)], capture_output=True, timeout=PATIENCE_S)
     return tried.returncode == 0
-
-
-@pytest.fixture(autouse=True)
-def small_recordings(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Leave the PSF out of recordings: it alone would fill the disk of these tests."""
-    monkeypatch.setattr("faintspot.engine.engine.packed", lambda *parts: None)
 
 
 @pytest.mark.parametrize("full", ["disk", "file"])

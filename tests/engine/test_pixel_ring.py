@@ -13,7 +13,7 @@ from multiprocessing.synchronize import Barrier
 
 import numpy as np
 import pytest
-from tests.engine.commands import process, start
+from tests.engine.commands import is_stale, needs_shared_memory, process, start
 from tests.patience import LIMIT_S, wait_for
 from tests.refusals import refused
 
@@ -21,10 +21,7 @@ from faintspot.base.errors import InputError
 from faintspot.engine.pixel_ring import ARRIVALS, FRAME, ROWS, PixelRing
 from faintspot.engine.segment import CLOSED, FOLDER
 
-pytestmark = [
-    pytest.mark.slow,
-    pytest.mark.skipif(not FOLDER.is_dir(), reason="needs POSIX shared memory as Linux has it"),
-]
+pytestmark = [needs_shared_memory, pytest.mark.slow]
 
 SHAPE = (24, 32)
 ROW_NUMBERS = np.arange(SHAPE[0])[:, None]
@@ -68,11 +65,6 @@ def read(name: str, last: int, answers: Queue[tuple[int, int, int]], meeting: Ba
             lapped += 1
     answers.put((looks, lapped, wrong))
     meeting.wait(LIMIT_S)
-
-
-def is_stale(ring: PixelRing) -> bool:
-    """Ask again: a type checker takes a property for a constant."""
-    return ring.stale
 
 
 def attached(name: str) -> PixelRing:

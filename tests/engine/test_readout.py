@@ -9,18 +9,15 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from tests.engine.commands import needs_shared_memory
 from tests.refusals import assert_each_refused, refused
 
 from faintspot.engine import readout
 from faintspot.engine.pixel_ring import PixelRing
 from faintspot.engine.readout import Readout, readout_type
-from faintspot.engine.segment import FOLDER
 from faintspot.slopes.simulate import Detector
 
-pytestmark = [
-    pytest.mark.skipif(not FOLDER.is_dir(), reason="needs POSIX shared memory as Linux has it"),
-    pytest.mark.slow,
-]
+pytestmark = [needs_shared_memory, pytest.mark.slow]
 
 SHAPE = 24, 32
 

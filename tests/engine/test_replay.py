@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from tests.engine.commands import needs_shared_memory
 from tests.refusals import assert_each_refused, refused
 
 from faintspot.base.errors import InputError
@@ -23,10 +24,7 @@ from faintspot.engine.readout import Replay, ring_type
 from faintspot.engine.segment import FOLDER
 from faintspot.io import FrameSource, open_frames
 
-pytestmark = [
-    pytest.mark.skipif(not FOLDER.is_dir(), reason="needs POSIX shared memory as Linux has it"),
-    pytest.mark.slow,
-]
+pytestmark = [needs_shared_memory, pytest.mark.slow]
 SHAPE = (6, 5)
 
 

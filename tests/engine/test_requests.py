@@ -5,8 +5,6 @@ import os
 import signal
 import socket
 import stat
-import subprocess
-import sys
 import tempfile
 import threading
 import time
@@ -18,17 +16,15 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from tests.engine.commands import start
 from tests.patience import wait_for
 from tests.refusals import refused
-from tests.shared_data import ROOT
 
 from faintspot.base.errors import InputError
 from faintspot.engine import requests as control
 from faintspot.engine.requests import LARGEST_REQUEST, ControlServer, request, socket_path
 
 pytestmark = pytest.mark.slow
-
-SOURCE = ROOT / "src"
 
 
 def add(fields: dict[str, Any]) -> dict[str, Any]:
@@ -292,7 +288,6 @@ def test_only_the_user_can_open_the_socket(server: ControlServer) -> None:
 
 STRANGER = """
 import os, sys
-sys.path.insert(0, sys.argv[2])
 from faintspot.base.errors import InputError
 from faintspot.engine.requests import request
 os.seteuid(65534)
@@ -309,14 +304,8 @@ def test_another_user_is_told_no(server: ControlServer, door_is_open: bool) -> N
     if door_is_open:
         server.path.parent.chmod(0o755)
         server.path.chmod(0o666)
-    done = subprocess.run(
-        [sys.executable, "-c", STRANGER, str(server.path), str(SOURCE)],
-        capture_output=True,
-        text=True,
-        timeout=60,
-        check=True,
-    )
-    assert done.stdout.splitlines() == ["the engine lab belongs to another user"]
+    said, _ = start(STRANGER, str(server.path)).communicate(timeout=60)
+    assert said.splitlines() == ["the engine lab belongs to another user"]
     assert is_well(server.path)
 
 
@@ -337,7 +326,6 @@ def test_a_living_server_is_not_replaced(server: ControlServer) -> None:
 
 VICTIM = """
 import sys, time
-sys.path.insert(0, sys.argv[2])
 from faintspot.engine.requests import ControlServer
 server = ControlServer(sys.argv[1], {})
 print("up", flush=True)
@@ -346,8 +334,7 @@ time.sleep(600)
 
 
 def test_what_a_killed_server_left_is_replaced(path: Path) -> None:
-    command = [sys.executable, "-c", VICTIM, str(path), str(SOURCE)]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as victim:
+    with start(VICTIM, str(path)) as victim:
         assert victim.stdout is not None
         assert victim.stdout.readline() == "up\n"
         with pytest.raises(InputError, match="already"):
@@ -377,14 +364,14 @@ def test_of_many_that_start_at_once_one_lives(path: Path) -> None:
     alive: list[ControlServer] = []
     refused: list[str] = []
 
-    def start() -> None:
+    def serve() -> None:
         try:
             alive.append(ControlServer(path, HANDLERS))
         except InputError as error:
             refused.append(str(error))
 
     for _ in range(20):
-        starters = [threading.Thread(target=start) for _ in range(8)]
+        starters = [threading.Thread(target=serve) for _ in range(8)]
         for thread in starters:
             thread.start()
         for thread in starters:

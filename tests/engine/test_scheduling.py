@@ -33,7 +33,7 @@ def test_priority_holds_for_threads_that_were_there_before_and_is_given_back() -
 @pytest.mark.slow
 def test_the_lowest_priority() -> None:
     code = (
-        "import os; from faintspot.engine.child_processes import lowest_priority; lowest_priority();"
+        "import os; from faintspot.engine.child_processes import low_priority; low_priority();"
         "print(os.sched_getscheduler(0) == os.SCHED_BATCH, os.nice(0))"
     )
     shown = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

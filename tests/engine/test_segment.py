@@ -6,12 +6,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from tests import refusals
+from tests.engine.commands import needs_shared_memory
 
 from faintspot.base.errors import InputError
 from faintspot.engine.pixel_ring import PixelRing
 from faintspot.engine.segment import FOLDER
 
-pytestmark = [pytest.mark.skipif(not FOLDER.is_dir(), reason="needs POSIX shared memory as Linux has it")]
+pytestmark = needs_shared_memory
 
 SHAPE = (24, 32)
 

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from tests.engine.commands import start
+from tests.engine.commands import needs_shared_memory, start
 from tests.loop.simulation.loop_cases import faint, plain
 from tests.patience import wait_for
 from tests.refusals import assert_each_refused, refused
@@ -45,10 +45,7 @@ from faintspot.slopes.pipeline import configuration as configuration_file
 
 pytest.importorskip("hcipy")
 pyshmem = pytest.importorskip("pyshmem")
-pytestmark = [
-    pytest.mark.skipif(not FOLDER.is_dir(), reason="needs POSIX shared memory as Linux has it"),
-    pytest.mark.slow,
-]
+pytestmark = [needs_shared_memory, pytest.mark.slow]
 CONFIGURATION = faint().replace("control", frame_rate_hz=1000.0)  # runs of single frames take no longer
 COMMANDS, PATIENCE_S = 54, 120.0
 
@@ -180,7 +177,7 @@ def test_the_mirror_keeps_its_commands_while_the_stream_is_gone_or_wrong(watched
     wrong = stream(COMMANDS - 1)
     wrong.write(np.ones(COMMANDS - 1), frame_id=8)
     wait_for(lambda: "holds (53,) float32, expected (54,)" in lines[-1], step=watched.frame)
-    assert held.state
+    assert held.obstacle
     wrong.unlink()
     again = stream(COMMANDS)
     wait_for(lambda: "54 commands (float32)" in lines[-1], step=watched.frame)
@@ -191,7 +188,7 @@ def test_the_mirror_keeps_its_commands_while_the_stream_is_gone_or_wrong(watched
     watched.frame()
     watched.frame()
     assert watched.truth["command_frame"] == 9
-    assert not held.state
+    assert not held.obstacle
     again.unlink()
 
 

@@ -13,7 +13,6 @@ from faintspot.engine.timing import (
     PREPARING,
     RESOLUTION,
     WOKEN_LATE,
-    Counters,
     Latencies,
     Lateness,
 )
@@ -66,13 +65,6 @@ def test_dict_is_in_microseconds_and_goes_through_json() -> None:
     assert found["max_us"] == 9000
     assert found["p99_9_us"] == pytest.approx(1, rel=RESOLUTION)
     assert list(found) == ["count", "mean_us", "min_us", "p50_us", "p99_us", "p99_9_us", "max_us"]
-
-
-def test_counters_are_plain_numbers() -> None:
-    counters = Counters()
-    counters.dropped += 2
-    assert counters.as_dict() == {**Counters().as_dict(), "dropped": 2}
-    assert set(Counters().as_dict().values()) == {0}
 
 
 def test_a_frame_in_time_has_no_cause() -> None:

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.errors import InputError
-from faintspot.engine.child_processes import ONE_THREAD, ChildProcesses, lowest_priority
+from faintspot.engine.child_processes import ONE_THREAD, ChildProcesses, low_priority
 from faintspot.engine.engine import Engine
 from faintspot.engine.requests import LENGTHY_TIMEOUT_S, request, socket_path
 from faintspot.engine.telemetry.ring import TelemetryRing
@@ -92,7 +92,7 @@ class BackgroundLearning:
 
     def run(self, say: Callable[[str], None]) -> None:
         """Learn at the lowest priority until the engine ends; `say` takes a line for each time."""
-        lowest_priority()
+        low_priority()
         try:
             while not self._reader.stale:
                 time.sleep(_LOOK_S)

@@ -164,9 +164,9 @@ def quick_switching(seconds: float = 50e-6) -> Iterator[None]:
         sys.setswitchinterval(before)
 
 
-def lowest_priority() -> None:
+def low_priority(niceness: int = _NICEST) -> None:
     """Leave the processor to others, also where the process was started with real-time priority."""
-    os.setpriority(os.PRIO_PROCESS, 0, _NICEST)
+    os.setpriority(os.PRIO_PROCESS, 0, max(niceness, os.getpriority(os.PRIO_PROCESS, 0)))
     if hasattr(os, "sched_setscheduler"):
         os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))  # pushes nobody aside when it wakes
 

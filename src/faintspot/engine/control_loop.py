@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.base.checks import number_between
 from faintspot.base.errors import InputError
 from faintspot.engine.guard import ControllerSuccessor, Guard, PreparedController
 from faintspot.engine.timing import Latencies
@@ -17,6 +16,7 @@ from faintspot.engine.workers import SlopePrior
 from faintspot.loop.control.base import KALMAN, CommandDelayLine, Controller
 from faintspot.loop.control.configuration import Control
 from faintspot.loop.control.integrator import MEAN_SQUARE, true_slopes
+from faintspot.slopes.estimators.registry import one_line
 from faintspot.slopes.kernels.compiling import Direct
 from faintspot.slopes.kernels.products import ProductPart
 from faintspot.slopes.pipeline.slopes import RESULT_TYPES, Slopes
@@ -245,8 +245,8 @@ class ControlLoop:
     def _fail(self, error: Exception) -> None:
         """Open the loop because its controller failed; the mirror keeps the latest command."""
         self._line.hold(self._line.latest.copy())
-        reason = f"the controller failed: {type(error).__name__}: {error}".split("\n")[0]
-        self.closed, self.opened_because = False, self.guard.end(reason)
+        self.guard.end()
+        self.closed, self.opened_because = False, f"the controller failed: {one_line(error)}"
 
     # Any thread -------------------------------------------------------------------------------------
 
@@ -324,12 +324,12 @@ class ControlLoop:
         Raises
         ------
         InputError
-            When the value is out of range, or no controller has a gain.
+            When no controller has a gain.
         """
         integrator = self._integrator
         if integrator is None:
             raise InputError(f"gain: the controller {self.control.options.controller!r} has no gain")
-        integrator.gain = number_between("gain", gain, 0, 2)
+        integrator.gain = gain
 
     @property
     def _integrator(self) -> Controller | None:

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections import Counter
+from collections.abc import Callable
 from contextlib import ExitStack
-from typing import TYPE_CHECKING, Any
+from itertools import count
+from typing import Any
 
 import numpy as np
 
@@ -15,10 +17,11 @@ from faintspot.engine import plan
 from faintspot.engine.control_loop import CLOSED, OPEN, STATES, ControlLoop
 from faintspot.engine.estimators import EngineEstimators
 from faintspot.engine.frame_path import FramePath
-from faintspot.engine.interleaving import EVERY, FIRST_METHOD, METHODS, Interleaving
+from faintspot.engine.interleaving import Interleaving
 from faintspot.engine.pixel_ring import PixelRing, living_ring
 from faintspot.engine.running_settings import Change, RunningSettings
-from faintspot.engine.streams.slope_streams import SlopeStreams
+from faintspot.engine.streams.bridge import StreamBridge
+from faintspot.engine.streams.slope_streams import PredictionStream, SlopeStreams
 from faintspot.engine.telemetry.ring import TelemetryRing
 from faintspot.engine.timing import INCOMPLETE, WORKER, FrameAccount
 from faintspot.engine.workers import SlopePrior, Workers
@@ -28,12 +31,8 @@ from faintspot.slopes.pipeline.configuration import to_text
 from faintspot.slopes.pipeline.settings import Settings
 from faintspot.slopes.pipeline.slope_pipeline import SlopePipeline
 
-if TYPE_CHECKING:
-    from faintspot.engine.streams.slope_streams import PredictionStream
-
 _WATCH_S = 0.02  # between two checks of the watcher
-_LOOKS_FOR_DARK = 10  # ditto, between two searches for dark sub-apertures
-_LOOKS_BETWEEN_STALE = 10  # asking the operating system whether the source is alive takes longer
+_LOOKS_BETWEEN_SLOW = 10  # ditto, between two of those that take longer
 
 
 class Engine:
@@ -50,9 +49,9 @@ class Engine:
     options : EngineOptions, optional
     interleaving : Interleaving, optional
         Configurations that take turns: changes of the settings, and controllers.
-    source : FrameInput, optional
-        Brings frames into the ring in the thread that measures them, e.g. a `StreamBridge`. Default: another
-        process writes into the ring.
+    source : StreamBridge, optional
+        Brings frames into the ring in the thread that measures them. Default: another process writes into the
+        ring.
     control : Control, optional
         Computes commands from slopes; the loop starts open. Default: no commands. The reference slopes are
         for the pipelines.
@@ -75,7 +74,7 @@ class Engine:
         options: plan.EngineOptions | None = None,
         *,
         interleaving: Interleaving | None = None,
-        source: plan.FrameInput | None = None,
+        source: StreamBridge | None = None,
         control: Control | None = None,
     ) -> None:
         options = plan.EngineOptions() if options is None else options
@@ -94,10 +93,8 @@ class Engine:
         self._arrival, self._number = 0, -1  # of the last measured frame
         # Frames of an own source are complete when they are measured: there is nothing to sleep for.
         self._sleeps, self._last_row_ns = source is None and not options.polls, 0
-        self._measured: dict[int, int] = {}  # frames, by configuration
+        self._measured = Counter[int]()  # frames, by configuration
         self._stopping = threading.Event()
-        self._resources = ExitStack()
-        """Closed in reverse order when the engine has run."""
         self._workers = Workers(threads - 1, options.cpus) if threads > 1 else None
         prior = None if control is None else SlopePrior(len(control.interaction) // 2)
         self.preparer = plan.SettingsPreparer(
@@ -107,26 +104,23 @@ class Engine:
         self.estimators = EngineEstimators(self.live, self.preparer)
         mean_flux = options.mean_flux
         self._flux = None if mean_flux is None else plan.FluxFollower(self.live, mean_flux)
-        self._dark = plan.DarkFollower(self.live.running.pipelines[0])
-        layout = self.live.running.layout
+        first, layout = self.live.running.pipelines[0], self.live.running.layout
+        self._dark = plan.DarkFollower(first)
         self._raw = np.zeros(layout.frame_shape, np.float32)
-        if control is not None:
+        if control is not None and prior is not None:
             control.check_fits(len(layout))
-            control.check_errors(self.live.running.pipelines[0].calibration)
-        if prior is not None:
+            control.check_errors(first.calibration)
             prior.largest_px = max(layout.frame_shape)
         commands = 0 if control is None else control.commands
         self._streams = SlopeStreams(name, len(layout), commands)
-        try:
-            self.loop = None
-            self._prediction: PredictionStream | None = None
-            if control is not None:
-                loop_prior = None if control.prediction == STREAM else prior
+        with ExitStack() as resources:
+            resources.callback(self._streams.close)
+            self.loop = self._prediction = None
+            if control is not None and prior is not None:
+                is_streamed = control.prediction == STREAM
+                loop_prior = None if is_streamed else prior
                 self.loop = ControlLoop(control, layout, self._streams.held_commands, loop_prior, threads)
-                if control.prediction == STREAM and prior is not None:
-                    from faintspot.engine.streams.slope_streams import PredictionStream  # rarely needed
-
-                    self._prediction = PredictionStream(name, prior)
+                self._prediction = PredictionStream(name, prior) if is_streamed else None
             self._make_ready(interleaving)
             self._telemetry = TelemetryRing.create(
                 name,
@@ -137,14 +131,11 @@ class Engine:
                 reference=None if control is None else control.reference,
                 control=packed_control(control),
             )
-            self._resources.callback(self._telemetry.close)
-            self._resources.callback(self._streams.close)
-            for part in (source, self._workers, self._prediction, self._flux):
+            for part in (self._telemetry, source, self._workers, self._prediction, self._flux):
                 if part is not None:
-                    self._resources.callback(part.close)
-        except InputError:
-            self._streams.close()
-            raise
+                    resources.callback(part.close)
+            self._resources = resources.pop_all()
+            """Closed in reverse order when the engine has run."""
 
     # Any thread -------------------------------------------------------------------------------------
 
@@ -193,21 +184,7 @@ class Engine:
         self._make_ready(new)
         with self.preparer.kept_if_right():
             self.preparer.interleaving = new
-            return self.live.renew({METHODS: new.labels, FIRST_METHOD: new.first, EVERY: new.every})
-
-    def renew_spots(
-        self, make_pipeline: Callable[[Settings], SlopePipeline], changes: Mapping[str, object]
-    ) -> Change:
-        """Replace what pipelines know of the spots; `changes` names it. For one thread at a time.
-
-        Raises
-        ------
-        InputError
-            When the settings do not fit; nothing changes then.
-        """
-        with self.preparer.kept_if_right():
-            self.preparer.make_pipeline = make_pipeline
-            return self.live.renew(changes)
+            return self.live.renew(new.as_change)
 
     def _make_ready(self, interleaving: Interleaving) -> None:
         """Prepare the controllers of all configurations, or refuse them."""
@@ -294,7 +271,7 @@ class Engine:
         path.set_dark(self._dark.dark, self._dark.changes)
         self._path, self._waiting = path, True
         arrival = self._arrival + 1
-        explain = self._images_every > 0 and self._measured.get(method, 0) % self._images_every == 0
+        explain = self._images_every > 0 and self._measured[method] % self._images_every == 0
         if self._prediction is not None:
             path.await_start(arrival, self._last_row_ns)
             self._prediction.fill(self._number + 1)
@@ -370,7 +347,7 @@ class Engine:
             if ring.intact(number, arrival):
                 self._telemetry.write_images(number, self._raw, path.denoised)
         self.account.finished(details, number, self._number if self._arrival else None)
-        self._measured[method] = self._measured.get(method, 0) + 1
+        self._measured[method] += 1
         self._arrival, self._number = arrival, number
         self._last_row_ns = moment if self._sleeps else 0
 
@@ -399,38 +376,27 @@ class Engine:
 
         Also do all that takes time: write changes to telemetry, replace dead workers, check streams.
         """
-        looks = last_change = 0
-        loop_assumed: dict[str, object] = {}
-        while True:
-            stopping = self._stopping.wait(_WATCH_S)
-            looks += 1
-            ring, path = self.preparer.ring, self._path
-            if ring is not None and path is not None and self._waiting:
-                gone = ring.closed or (looks % _LOOKS_BETWEEN_STALE == 0 and ring.stale)
-                if stopping or gone:
-                    path.stop()
+        last_change, loop_state = 0, dict[str, object]()
+        for looks in count(1):
+            stopping, is_slow = self._stopping.wait(_WATCH_S), looks % _LOOKS_BETWEEN_SLOW == 0
+            ring, path = self.preparer.ring, self._path if self._waiting else None
+            gone = ring is not None and (ring.closed or (is_slow and ring.stale))
+            if ring is not None and path is not None and (stopping or gone):
+                path.stop()
             if self._workers is not None:
                 self.counters.worker_restarts += self._workers.replace_dead()
             self.live.let_go()
-            if looks % _LOOKS_FOR_DARK == 0:
-                self._dark.look()
             if self._prediction is not None:
                 self._prediction.look_after()
-            if looks % _LOOKS_BETWEEN_STALE == 0:
+            if is_slow:
+                self._dark.look()
                 self._streams.look_after_commands()
-            loop_assumed = self._tell_of_loop(loop_assumed)
+            if self.loop is not None and (state := self.loop.noted_state()) != loop_state:
+                self._telemetry.write_change(self._number, self.live.change_number, state, None)
+                loop_state = state
             self.counters.settings_changes = self.live.change_number
             for change in self.live.taken(after=last_change):
                 self._telemetry.write_change(*change)
                 last_change = change[1]
             if stopping and (ring is None or not self._waiting):
                 return
-
-    def _tell_of_loop(self, last: dict[str, object]) -> dict[str, object]:
-        """Write to telemetry when the loop was opened, and why, or closed, or its gain changed."""
-        if self.loop is None:
-            return last
-        state = self.loop.noted_state()
-        if state != last:
-            self._telemetry.write_change(self._number, self.live.change_number, state, None)
-        return state

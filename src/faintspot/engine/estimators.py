@@ -18,7 +18,6 @@ from typing import Any
 
 from faintspot.base.errors import InputError
 from faintspot.base.text_files import parse_json, to_json
-from faintspot.engine.interleaving import EVERY, FIRST_METHOD, METHODS
 from faintspot.engine.plan import EnginePlan, SettingsPreparer
 from faintspot.engine.python_path import call_within, tried
 from faintspot.engine.requests import EFFECT_TIMEOUT_S
@@ -271,11 +270,9 @@ class EngineEstimators:
         self._fallen_back(fallback, estimator_fault=fault)
 
     def _fallen_back(self, fallback: EnginePlan, **more: str) -> Change:
-        self._preparer.interleaving = turns = fallback.interleaving
+        self._preparer.interleaving = fallback.interleaving
         changes = {"estimator": fallback.settings.estimator.name, **more}
-        return self._live.offer(
-            fallback, {**changes, METHODS: turns.labels, FIRST_METHOD: turns.first, EVERY: turns.every}
-        )
+        return self._live.offer(fallback, {**changes, **fallback.interleaving.as_change})
 
     def _renewed(self, names: set[str]) -> int | None:
         """Prepare settings with these estimators again; return the first frame measured with them."""

@@ -119,12 +119,11 @@ class Guard:
         """Total weight of the frames so far."""
         return 1 - (1 - self._share) ** max(self._frames, 1) if self._share < 1 else 1.0
 
-    def end(self, reason: str = "") -> str:
-        """Treat the loop as open, until it is closed by request; return the reason."""
+    def end(self) -> None:
+        """Treat the loop as open, until it is closed by request."""
         self._returns = False
         self._forget()
         self._spots.forget()
-        return reason
 
     def _opened(self, reason: str) -> str:
         """Treat the loop as opened by this guard; return the reason."""

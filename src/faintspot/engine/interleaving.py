@@ -74,6 +74,11 @@ class Interleaving:
         """Names of the configurations."""
         return [method.label for method in self.methods]
 
+    @property
+    def as_change(self) -> dict[str, object]:
+        """Change of settings that tells of this interleaving in telemetry."""
+        return {METHODS: self.labels, FIRST_METHOD: self.first, EVERY: self.every}
+
     @classmethod
     def parse(cls, text: str, every: int = 1, first: int = 0) -> Interleaving:
         """Parse a text such as "none,tv:0.6,tv:0.8" or "integrator,map+kalman".

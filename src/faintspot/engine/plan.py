@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,18 +28,6 @@ from faintspot.slopes.pipeline.light import MeanFlux, MeanLight
 from faintspot.slopes.pipeline.settings import Settings
 from faintspot.slopes.pipeline.slope_pipeline import SlopePipeline
 from faintspot.slopes.sensor.layout import Layout
-
-
-class FrameInput(Protocol):
-    """Source that brings frames into the ring in the engine's own thread."""
-
-    def step(self) -> bool:
-        """Wait a moment for a frame; return whether one has come."""
-        ...
-
-    def close(self) -> None:
-        """Release all resources."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -310,7 +298,6 @@ class DarkFollower:
         return True
 
 
-TIME_CONSTANT_FRAMES = 1000.0
 _FEWEST_FRAMES = 100  # before the first change
 _BETWEEN_S = 0.1
 
@@ -340,9 +327,7 @@ class FluxFollower:
         When the time constant is below 1.
     """
 
-    def __init__(
-        self, live: RunningSettings[EnginePlan], time_constant_frames: float = TIME_CONSTANT_FRAMES
-    ) -> None:
+    def __init__(self, live: RunningSettings[EnginePlan], time_constant_frames: float) -> None:
         self._live = live
         self._longest = number_between("mean_flux", time_constant_frames, 1)
         self._mean = np.zeros(len(live.running.layout))

@@ -23,6 +23,7 @@ from faintspot.slopes.kernels.groups import CALIBRATED
 from faintspot.slopes.kernels.products import ProductPart
 from faintspot.slopes.pipeline.settings import Settings
 from faintspot.slopes.pipeline.slope_pipeline import SlopePipeline
+from faintspot.slopes.simulate import Detector, sensor_frames
 
 Result = TypeVar("Result")
 _TRIAL = "faintspot-trial"
@@ -87,7 +88,6 @@ def end_thread(thread: threading.Thread) -> None:
 
 _FLUX_E = 300.0
 _NOISE_E = 3.0
-_SPOT_STD_PX = 1.0
 _SATURATED_ADU = 65535.0  # if the detector's saturation is not known
 
 
@@ -106,20 +106,16 @@ def trial_frames(pipeline: SlopePipeline) -> list[NDArray[np.float32]]:
 
 def typical_frame(pipeline: SlopePipeline) -> NDArray[np.float32]:
     """Return a frame (h, w) in ADU with a spot in every sub-aperture and read noise; the same each time."""
-    layout = pipeline.layout
+    electrons, _ = sensor_frames(
+        pipeline.layout,
+        1,
+        flux_e=_FLUX_E,
+        position_range_px=0.5,
+        detector=Detector(read_noise_e=_NOISE_E),
+        rng=np.random.default_rng(2015),
+    )
     dark, scale = _dark_and_scale(pipeline)
-    rng = np.random.default_rng(2015)
-    ny, nx = layout.window
-    rows, columns = np.arange(ny) - 0.5 * (ny - 1), np.arange(nx) - 0.5 * (nx - 1)
-    spots = np.zeros(layout.frame_shape)
-    for row, column in layout.corners:
-        x, y = rng.uniform(-0.5, 0.5, 2)
-        squared = (rows[:, None] - y) ** 2 + (columns - x) ** 2
-        profile = np.exp(-0.5 * squared / _SPOT_STD_PX**2)
-        spots[row : row + ny, column : column + nx] = _FLUX_E * profile / profile.sum()
-    noise = _NOISE_E * rng.standard_normal(layout.frame_shape)
-    frame: NDArray[np.float32] = (dark + (spots + noise) / scale).astype(np.float32)
-    return frame
+    return np.asarray(dark + electrons[0] / scale, np.float32)
 
 
 def _dark_and_scale(pipeline: SlopePipeline) -> NDArray[np.float32]:
@@ -129,7 +125,6 @@ def _dark_and_scale(pipeline: SlopePipeline) -> NDArray[np.float32]:
     return maps
 
 
-BUDGET_S = 1e-3
 MOST_FAILURES = 3  # consecutive frames that fail or exceed the budget
 LONGEST_BUDGETS = 10  # longest wait for a frame, in budgets
 _PATIENT_BUDGETS = 100  # the same while a trial delays all threads
@@ -156,9 +151,7 @@ class PythonPath(FramePath):
         Time limit of the estimator for one frame.
     """
 
-    def __init__(
-        self, pipeline: SlopePipeline, *arguments: Any, budget_s: float = BUDGET_S, **options: Any
-    ) -> None:
+    def __init__(self, pipeline: SlopePipeline, *arguments: Any, budget_s: float, **options: Any) -> None:
         super().__init__(pipeline, *arguments, **options)
         prepared = pipeline.plan.prepared
         if not isinstance(prepared, PythonPlan):

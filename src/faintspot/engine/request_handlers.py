@@ -83,7 +83,9 @@ def _take_spots(engine: Engine, fields: Mapping[str, object]) -> Mapping[str, ob
     if not isinstance(maker := engine.preparer.make_pipeline, PipelineMaker):
         raise InputError("spots: this engine does not know how its pipelines are made")
     file = _text(fields, "spots")
-    change = engine.renew_spots(replace(maker, **Configuration(file).spot), {"spots": file})
+    with engine.preparer.kept_if_right():
+        engine.preparer.make_pipeline = replace(maker, **Configuration(file).spot)
+        change = engine.live.renew({"spots": file})
     return {"frame": engine.live.wait(change, EFFECT_TIMEOUT_S)}
 
 
@@ -108,12 +110,8 @@ def loop_command(engine: Engine, fields: Mapping[str, object]) -> Mapping[str, o
         return {"loop": engine.loop_status()}
     if loop is None:
         raise InputError("loop: this engine makes no commands; add [control] to its configuration")
-    if action == "open":
-        loop.open()
-    elif action == "close":
-        loop.close()
-    elif action == "gain":
+    if action == "gain":
         loop.gain = number_between("gain", fields.get("gain"), 0, 2)
-    elif action == "flat":
-        loop.flatten()
+    else:
+        {"open": loop.open, "close": loop.close, "flat": loop.flatten}[action]()
     return {"loop": engine.loop_status()}

@@ -289,10 +289,14 @@ class ControlServer(Closing):
             if not isinstance(command, str) or command not in self._handlers:
                 commands = ", ".join(sorted(self._handlers))
                 raise InputError(f"command = {command!r:.80}: expected one of {commands}")
-        except InputError as error:
-            return _encoded(_refusal(str(error)))
-        with self._lengthy_one if command in self._lengthy else self._brief_one:
-            return _answer(self._handlers[command], fields)
+            with self._lengthy_one if command in self._lengthy else self._brief_one:
+                reply = _encoded({"ok": True, **self._handlers[command](fields)})
+            if len(reply) > _LARGEST_REPLY:
+                raise InputError(f"reply: expected at most {_LARGEST_REPLY} bytes, got {len(reply)}")
+            return reply
+        except BaseException as error:  # a command's fault or exit must not end the channel
+            text = str(error) if isinstance(error, InputError) else f"{type(error).__name__}: {error}"
+            return _encoded({"ok": False, "error": " ".join(text.split())[:2000]})
 
 
 class _Listener(socketserver.ThreadingUnixStreamServer):
@@ -332,25 +336,8 @@ class _Conversation(socketserver.StreamRequestHandler):
 # Messages -------------------------------------------------------------------------------------------
 
 
-def _answer(handler: Handler, fields: dict[str, object]) -> bytes:
-    """Carry out a command; always return a reply."""
-    try:
-        reply = _encoded({"ok": True, **handler(fields)})
-        if len(reply) > _LARGEST_REPLY:
-            raise InputError(f"reply: expected at most {_LARGEST_REPLY} bytes, got {len(reply)}")
-        return reply
-    except InputError as error:
-        return _encoded(_refusal(str(error)))
-    except BaseException as error:  # a command's fault or exit must not end the channel
-        return _encoded(_refusal(f"{type(error).__name__}: {error}"))
-
-
 def _encoded(message: Mapping[str, object], *, exact: bool = False) -> bytes:
     return to_json(message, exact=exact).encode() + b"\n"
-
-
-def _refusal(text: str) -> dict[str, object]:
-    return {"ok": False, "error": " ".join(text.split())[:2000]}
 
 
 def _parsed_request(line: bytes) -> dict[str, object]:

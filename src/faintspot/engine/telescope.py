@@ -145,8 +145,6 @@ class SimulatedTelescope(Readout, Closing):
     seed : int, optional
         Default: the configuration's.
     realisation : int
-    slots : int
-        Frames in the ring.
     say : function, optional
         Called with a one-line message about the commands, and when the pace cannot be kept.
     keep_truth : function, optional
@@ -174,7 +172,6 @@ class SimulatedTelescope(Readout, Closing):
         *,
         seed: int | None = None,
         realisation: int = 0,
-        slots: int = 4,
         say: Callable[[str], None] | None = None,
         keep_truth: Callable[[tuple[float, ...]], None] | None = None,
         **rows: Unpack[RowTimes],
@@ -188,7 +185,7 @@ class SimulatedTelescope(Readout, Closing):
         layout, mirror = telescope_model.optics.sensor.layout, telescope_model.optics.mirror
         dtype = readout_type(make_detector(configuration))
         with ExitStack() as undo:
-            ring = undo.enter_context(PixelRing.create(name, layout.frame_shape, dtype, slots=slots))
+            ring = undo.enter_context(PixelRing.create(name, layout.frame_shape, dtype))
             super().__init__(
                 ring,
                 layout.frame_shape,
@@ -261,7 +258,7 @@ class SimulatedTelescope(Readout, Closing):
             "commands": {
                 "stream": self.commands.stream,
                 "length": self.telescope_model.optics.mirror.commands,
-                "obstacle": self.commands.state,
+                "obstacle": self.commands.obstacle,
                 **asdict(self.commands.counters),
             },
         }
@@ -289,7 +286,7 @@ class SimulatedTelescope(Readout, Closing):
     def _begin(self, number: int) -> Future[Exposure]:
         """Begin an exposure with the present conditions and commands."""
         begun_s = time.monotonic()
-        self.commands.take()
+        self.commands.update()
         time_s = (number + 0.5) / self.configuration.control.frame_rate_hz
         with self._orders:
             order, self._order = self._order, None

@@ -3,6 +3,7 @@
 import math
 import resource
 from array import array
+from collections import Counter
 from dataclasses import asdict, dataclass
 
 import numpy as np
@@ -118,10 +119,6 @@ class Counters:
     worker_restarts: int = 0
     """Worker threads that died and were replaced."""
 
-    def as_dict(self) -> dict[str, object]:
-        """Return the counters by name."""
-        return asdict(self)
-
 
 IN_TIME, PREPARING, PAGE_FAULT, PREEMPTED, BLOCKED, WOKEN_LATE, OTHER, INCOMPLETE, WORKER = range(9)
 CAUSES = (
@@ -183,9 +180,9 @@ class FrameAccount:
 
     def __init__(self, deadline_s: float) -> None:
         self.counters, self.latencies = Counters(), Latencies()
-        self.late_because: dict[str, int] = {}
+        self.late_because = Counter[str]()
         """Number of late frames by cause; see `CAUSES`."""
-        self.lost_because: dict[str, int] = {}
+        self.lost_because = Counter[str]()
         """Number of lost frames by cause."""
         self._deadline_ns, self._lateness = round(deadline_s * 1e9), Lateness()
         self._lost = 0, IN_TIME  # since the last published frame: their number, and the last one's cause
@@ -198,7 +195,7 @@ class FrameAccount:
         counters.estimator_failures += path.failed
         counters.late += late
         if late:
-            _count(self.late_because, cause)
+            self.late_because[CAUSES[cause]] += 1
         causes = cause, *self._lost
         self._lost = 0, IN_TIME
         return causes
@@ -233,19 +230,14 @@ class FrameAccount:
         cause = found if cause is None else cause
         self.counters.frames_in += frames
         self.counters.dropped += frames
-        _count(self.lost_because, cause, frames)
+        self.lost_because[CAUSES[cause]] += frames
         self._lost = self._lost[0] + frames, cause
 
     def as_dict(self) -> dict[str, object]:
         """Return everything as plain values."""
         return {
-            "counters": self.counters.as_dict(),
+            "counters": asdict(self.counters),
             "late_because": dict(self.late_because),
             "lost_because": dict(self.lost_because),
             "latency": self.latencies.as_dict(),
         }
-
-
-def _count(causes: dict[str, int], cause: int, frames: int = 1) -> None:
-    """Count frames of a cause."""
-    causes[CAUSES[cause]] = causes.get(CAUSES[cause], 0) + frames

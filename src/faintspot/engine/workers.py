@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from faintspot.base.errors import InputError
 from faintspot.slopes.camera.calibration import Calibration
+from faintspot.slopes.estimators.registry import one_line
 from faintspot.slopes.kernels import streaming
 from faintspot.slopes.kernels.ordered import load, store
 from faintspot.slopes.pipeline.settings import Settings
@@ -183,7 +184,7 @@ class Workers:
             try:
                 self._completed[number] = task is not None and task(number)
             except BaseException as error:
-                self.fault = f"{type(error).__name__}: {error}".split("\n")[0]
+                self.fault = one_line(error)
                 return
             done += 1
             store(cells, number * _LINE, done)

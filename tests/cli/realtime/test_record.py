@@ -5,18 +5,18 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from tests.engine.commands import needs_shared_memory
 
 pytest.importorskip("zarr")
 
 from tests.cli.cli_cases import Commands
 from tests.engine.telemetry_cases import LAYOUT, SETTINGS, Engine, as_written
 
-from faintspot.engine.segment import FOLDER
 from faintspot.engine.telemetry.ring import TelemetryRing
 from faintspot.io import read_telemetry
 
 pytestmark = [
-    pytest.mark.skipif(not FOLDER.is_dir(), reason="needs POSIX shared memory as Linux has it"),
+    needs_shared_memory,
     # A sensor alone has neither, of which the reader of AOT files complains.
     pytest.mark.filterwarnings("ignore:.AOT_(WAVEFRONT_CORRECTORS|LOOPS). .* contains no data"),
 ]

@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tests.engine.commands import needs_shared_memory
 
 pytest.importorskip("pyshmem")
 
@@ -15,10 +16,9 @@ from faintspot import Layout, Settings
 from faintspot.base.errors import InputError
 from faintspot.engine import engine
 from faintspot.engine.plan import EngineOptions
-from faintspot.engine.segment import FOLDER
 from faintspot.loop.control.configuration import save_control
 
-pytestmark = pytest.mark.skipif(not FOLDER.is_dir(), reason="needs POSIX shared memory as Linux has it")
+pytestmark = needs_shared_memory
 
 
 def test_options_are_passed_on(run: Commands, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

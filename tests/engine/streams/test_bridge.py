@@ -10,19 +10,16 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tests.engine.commands import needs_shared_memory
 from tests.patience import wait_for
 
 from faintspot.base.errors import InputError
 from faintspot.engine.pixel_ring import PixelRing
-from faintspot.engine.segment import FOLDER
 from faintspot.engine.streams import bridge as bridge_module
 from faintspot.engine.streams.bridge import BridgeCounters, StreamBridge
 
 pyshmem = pytest.importorskip("pyshmem")
-pytestmark = [
-    pytest.mark.skipif(not FOLDER.is_dir(), reason="needs POSIX shared memory as Linux has it"),
-    pytest.mark.slow,
-]
+pytestmark = [needs_shared_memory, pytest.mark.slow]
 SHAPE = (6, 5)
 
 
@@ -72,6 +69,15 @@ def created(name: str, dtype: Any = np.uint16, shape: tuple[int, int] = SHAPE, *
     return pyshmem.create(f"{name}_in", shape=shape, dtype=dtype, **options)
 
 
+@pytest.fixture
+def stream(name: str, running: Running) -> Iterator[Any]:
+    """A stream of the usual frames, which the bridge has found."""
+    made = created(name)
+    running.said("6 x 5 pixels")
+    yield made
+    made.unlink()
+
+
 @pytest.mark.parametrize("notify", [False, True])
 @pytest.mark.parametrize("dtype", ["uint16", "int32", "float64"])
 def test_frames_of_a_stream_arrive_in_the_ring(name: str, running: Running, dtype: str, notify: bool) -> None:
@@ -88,9 +94,7 @@ def test_frames_of_a_stream_arrive_in_the_ring(name: str, running: Running, dtyp
     stream.unlink()
 
 
-def test_the_producers_numbers(name: str, running: Running) -> None:
-    stream = created(name)
-    running.said("6 x 5 pixels")
+def test_the_producers_numbers(name: str, running: Running, stream: Any) -> None:
     ring = PixelRing.attach(name)
     for number in (0, 1, 2, 7, 2**40, 3):
         stream.write(frame(number), frame_id=number)
@@ -98,7 +102,6 @@ def test_the_producers_numbers(name: str, running: Running) -> None:
         np.testing.assert_array_equal(ring.slot(number), frame(number))
     assert running.counters.taken == 6
     assert running.counters.not_ahead == 1
-    stream.unlink()
 
 
 def test_nan_passes_and_too_large_is_infinite(name: str, running: Running) -> None:
@@ -169,10 +172,8 @@ def test_a_stream_without_frames_is_waited_out(name: str, running: Running) -> N
     stream.unlink()
 
 
-def test_silence_is_told_once(name: str, running: Running, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_silence_is_told_once(running: Running, stream: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(bridge_module, "STALL_S", 0.2)
-    stream = created(name)
-    running.said("6 x 5 pixels")
     for number in range(2):
         stream.write(frame(number))
         wait_for(lambda number=number: running.counters.stalls == number + 1)
@@ -180,7 +181,6 @@ def test_silence_is_told_once(name: str, running: Running, monkeypatch: pytest.M
     time.sleep(0.5)
     assert running.counters.stalls == 2
     running.said(f"pid {os.getpid()}, which made it, is alive")
-    stream.unlink()
 
 
 def _die_while_writing(name: str, ready: Any) -> None:
@@ -223,13 +223,10 @@ def test_the_ring_belongs_to_somebody_else(name: str) -> None:
         StreamBridge(f"{name}_in", name).run(0)
 
 
-def test_idle_leaves_the_processor_alone(name: str, running: Running) -> None:
+def test_idle_leaves_the_processor_alone(running: Running, stream: Any) -> None:
     """Without frames less than half of a processor is used: a loop without pauses would use one."""
-    stream = created(name)
-    running.said("6 x 5 pixels")
     stream.write(frame(0))
     time.sleep(0.2)
     start, processor = time.monotonic(), time.process_time()
     time.sleep(1.0)
     assert time.process_time() - processor < 0.5 * (time.monotonic() - start)
-    stream.unlink()

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tests.engine.commands import start
+from tests.engine.commands import needs_shared_memory, start
 from tests.engine.image_files import IsioFile
 from tests.patience import LIMIT_S, wait_for
 
@@ -22,10 +22,7 @@ from faintspot.engine.streams.image_stream import ImageStream, ImageStreamWriter
 from faintspot.engine.streams.stream import Follower, open_stream
 
 pyshmem = pytest.importorskip("pyshmem")
-pytestmark = [
-    pytest.mark.slow,
-    pytest.mark.skipif(not FOLDER.is_dir(), reason="needs shared memory as Linux has it"),
-]
+pytestmark = [needs_shared_memory, pytest.mark.slow]
 
 
 @pytest.fixture(autouse=True)
@@ -158,7 +155,7 @@ def test_what_is_no_stream_is_refused(folder: Path) -> None:
         open_stream("isio:long")
     for bad in ("isio:a/b", "isio:", "isio:x y", f"isio:{'x' * 90}"):
         with pytest.raises(InputError, match="expected"):
-            Follower(bad, print, lambda shape, dtype: "", lambda: "")
+            Follower(bad)
 
 
 def test_random_metadata_never_end_the_process(folder: Path) -> None:

@@ -7,7 +7,6 @@ import os
 import platform
 import stat
 import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Iterator
@@ -17,6 +16,7 @@ from uuid import uuid4
 
 import numpy as np
 import pytest
+from tests.engine.commands import start
 
 from faintspot.base.errors import InputError
 from faintspot.engine.segment import FOLDER
@@ -143,9 +143,7 @@ def test_what_is_damaged_is_replaced(name: str, part: int) -> None:
 
 
 MAKER = """
-import os, sys
-sys.path[:0] = sys.argv[2:]
-import pyshmem
+import os, sys, pyshmem
 pyshmem.create(sys.argv[1], shape=(4,))
 print("made", flush=True)
 sys.stdin.read()
@@ -154,10 +152,8 @@ os._exit(0)
 
 
 def maker(name: str) -> Any:
-    command = [sys.executable, "-c", MAKER, name]
     environment = {**os.environ, "PYSHMEM_LOCK_DIR": str(lock_file(name).parent)}
-    pipe = subprocess.PIPE
-    process = subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True, env=environment)
+    process = start(MAKER, name, stdin=subprocess.PIPE, env=environment)
     assert process.stdout is not None
     assert process.stdout.readline() == "made\n"
     return process

@@ -8,7 +8,14 @@ import pytest
 from tests.slopes.recorded.recorded_cases import Page
 
 from faintspot.base.errors import InputError
-from faintspot.engine.telemetry.numbers import change_rows, gaps, methods_in_turn, quantities, timing
+from faintspot.engine.telemetry.numbers import (
+    change_rows,
+    compared_methods,
+    gaps,
+    method_names,
+    quantities,
+    timing,
+)
 from faintspot.engine.telemetry.page import latency_figure, report_of_telemetry
 from faintspot.engine.telemetry.recorder import TelemetryStore
 from faintspot.engine.telemetry.ring import image_type, layout_values, record_type
@@ -69,9 +76,11 @@ def test_rates_and_lost_frames(night: Telemetry) -> None:
 
 
 def test_methods_in_turn_differ_as_they_were_made(night: Telemetry) -> None:
-    values = quantities(night)
-    rms = methods_in_turn(night, values["rms of slopes about their mean (px)"])
-    flux = methods_in_turn(night, values["flux (e-)"])
+    values, names = quantities(night), method_names(night)
+    rms, flux = (
+        compared_methods(night.method, names, values[name])
+        for name in ("rms of slopes about their mean (px)", "flux (e-)")
+    )
     assert [method.method for method in rms] == ["none", "tv"]
     assert rms[0].difference is None
     for compared, true in ((rms, RMS_PX[1] - RMS_PX[0]), (flux, FLUX_E[1] - FLUX_E[0])):

@@ -15,18 +15,17 @@ import pytest
 
 pytest.importorskip("zarr")
 
-from tests.engine.commands import process
+from tests.engine.commands import needs_shared_memory, process
 from tests.engine.telemetry_cases import LAYOUT, SETTINGS, Engine, as_written, write, write_images
 from tests.patience import wait_for
 
 from faintspot.base.errors import InputError
-from faintspot.engine.segment import FOLDER
 from faintspot.engine.telemetry import recorder
 from faintspot.engine.telemetry.recorder import Recorder, TelemetryStore
 from faintspot.engine.telemetry.ring import TelemetryRing
 from faintspot.io import read_telemetry
 
-pytestmark = pytest.mark.skipif(not FOLDER.is_dir(), reason="needs POSIX shared memory as Linux has it")
+pytestmark = needs_shared_memory
 with_threads = pytest.mark.slow
 
 PATIENCE_S = 60.0

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tests.engine.commands import process
+from tests.engine.commands import is_stale, needs_shared_memory, process
 from tests.engine.telemetry_cases import LAYOUT, SETTINGS, N, as_written, slopes_of, write, write_images
 from tests.patience import LIMIT_S
 
@@ -17,10 +17,7 @@ from faintspot.engine.segment import FOLDER
 from faintspot.engine.telemetry.ring import TelemetryRing
 from faintspot.slopes.sensor.layout import Layout
 
-pytestmark = [
-    pytest.mark.slow,
-    pytest.mark.skipif(not FOLDER.is_dir(), reason="needs POSIX shared memory as Linux has it"),
-]
+pytestmark = [needs_shared_memory, pytest.mark.slow]
 
 
 def write_on(name: str, ready: Event, enough: Event) -> None:
@@ -33,11 +30,6 @@ def write_on(name: str, ready: Event, enough: Event) -> None:
                 write(ring, frame)
                 frame += 1
             write_images(ring, frame)
-
-
-def is_stale(reader: TelemetryRing) -> bool:
-    """Ask again: a type checker takes a property for a constant."""
-    return reader.stale
 
 
 def test_commands_and_the_loops_state(name: str) -> None:

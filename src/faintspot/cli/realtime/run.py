@@ -65,13 +65,12 @@ def live(recording: Path | None, name: str, bind: str, port: int, private: bool,
       faintspot live
       faintspot live night.zarr
     """
+    from faintspot.engine.child_processes import low_priority
     from faintspot.engine.page.server import serve
 
     if recording is None:
         require_linux("live without a recording")
-    os.nice(_NICENESS)
-    if hasattr(os, "sched_setscheduler"):
-        os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))  # pushes nobody aside when it wakes
+    low_priority(_NICENESS)
     with stop_on_signal() as stop:
         shown = name if recording is None else recording
         serve(shown, stop, _say, address=bind, port=port, private=private, folder=folder)

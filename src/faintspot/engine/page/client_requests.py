@@ -14,6 +14,7 @@ from faintspot.base.errors import InputError
 from faintspot.base.tables import parse_changes, parse_ranges
 from faintspot.engine.requests import LENGTHY_TIMEOUT_S, request, since, socket_path
 from faintspot.engine.telemetry.recorder import Recorder
+from faintspot.slopes.estimators.registry import one_line
 
 ClientRequest = Callable[[dict[str, Any]], Mapping[str, Any]]
 _FILE = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,90}\.zarr")
@@ -36,10 +37,8 @@ def answered(client_requests: ClientRequests, request: dict[str, Any]) -> dict[s
         if wish is None:
             raise InputError(f"do = {request['do']!r:.40}: expected one of {', '.join(functions)}")
         return {"ok": True, **wish(request)}
-    except InputError as error:
-        return {"ok": False, "error": str(error)}
     except Exception as error:  # a fault in a request must not end the server
-        return {"ok": False, "error": " ".join(f"{type(error).__name__}: {error}".split())[:500]}
+        return {"ok": False, "error": one_line(error)}
 
 
 class EngineRequests:

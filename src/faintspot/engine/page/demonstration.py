@@ -204,13 +204,8 @@ class LiveDemonstration:
 
     def _interleave(self, methods: list[str], shown: Shown) -> None:
         """Let methods take turns from now on."""
-        request(
-            socket_path(self.name),
-            "interleave",
-            timeout_s=LENGTHY_TIMEOUT_S,
-            methods=",".join(methods),
-            every=self.turn_frames,
-        )
+        turns = {"methods": ",".join(methods), "every": self.turn_frames}
+        self._asked("interleave", timeout_s=LENGTHY_TIMEOUT_S, **turns)
         shown.begin(short_names(methods))
 
     def _check_name(self) -> None:

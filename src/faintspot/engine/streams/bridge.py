@@ -43,7 +43,7 @@ class BridgeCounters(StreamCounters):
     """Number of times that no frame came for `STALL_S`."""
 
 
-class StreamBridge:
+class StreamBridge(Follower):
     """Bridge that copies a stream's frames into a pixel ring, also after restarts of the producer.
 
     A frame's number is pyshmem's `frame_id` where the producer sets one, else the publication count minus
@@ -58,8 +58,6 @@ class StreamBridge:
         Name of the pixel ring.
     say : function, optional
         Called with a one-line message when the stream appears, stalls or changes.
-    slots : int
-        Frames in the ring.
     spins : bool, optional
         Whether to poll for the next frame without a pause. Default: with enough processors.
 
@@ -71,25 +69,19 @@ class StreamBridge:
         When the stream is pyshmem's and pyshmem is not installed.
     """
 
+    counters: BridgeCounters
+    holds = "pixels"
+
     def __init__(
         self,
         stream: str,
         name: str,
         *,
         say: Callable[[str], None] | None = None,
-        slots: int = 4,
         spins: bool | None = None,
     ) -> None:
-        self.stream, self.name, self._slots = stream, name, slots
-        self.counters = BridgeCounters()
-        self._follower = Follower(
-            stream,
-            say or (lambda _: None),
-            _no_frames,
-            counters=self.counters,
-            holds="pixels",
-            prepare=self._prepare,
-        )
+        super().__init__(stream, say, _no_frames)
+        self.name, self.counters = name, BridgeCounters()
         enough = len(os.sched_getaffinity(0)) >= SPINNING_NEEDS
         self._spin_s = SPIN_S if (enough if spins is None else spins) else 0.0
         self._ring: PixelRing | None = None
@@ -122,14 +114,14 @@ class StreamBridge:
         InputError
             As `run`.
         """
-        if self._follower.source is not None and self._new_one():
+        if self.source is not None and self._new_one():
             return self._pass_on()
         self._look_after()
         return False
 
     def close(self) -> None:
         """Close the stream and remove the ring."""
-        self._follower.close()
+        super().close()
         if self._ring is not None:
             self._ring.close()
             self._ring = None
@@ -138,7 +130,7 @@ class StreamBridge:
 
     def _new_one(self) -> bool:
         """Wait for a publication; return False if none comes in time."""
-        source, last_count = not_none(self._follower.source), self._follower.seen
+        source, last_count = not_none(self.source), self.seen
         end = self._arrived + self._spin_s
         while source.count == last_count:
             if time.monotonic() > end:
@@ -147,14 +139,13 @@ class StreamBridge:
 
     def _pass_on(self) -> bool:
         """Copy the newest publication into the ring; return whether it was whole."""
-        follower, counters = self._follower, self.counters
-        source, ring = not_none(follower.source), not_none(self._ring)
+        source, ring, counters = not_none(self.source), not_none(self._ring), self.counters
         expected = source.number
         slot = ring.begin(expected)
         with np.errstate(over="ignore"):  # values beyond float32 become infinite: bad pixels
-            publication = follower.take(_PARK_S, slot)
+            publication = self.take(_PARK_S, slot)
         if publication is None:
-            follower.seen = source.count
+            self.seen = source.count
             return False
         number = publication.number
         if number != expected:  # a newer frame was published meanwhile
@@ -163,7 +154,7 @@ class StreamBridge:
         counters.taken += 1
         counters.not_ahead += number <= self._last_number
         if self._silent and self._last_number >= 0:
-            follower.say("resumed")
+            self.say("resumed")
         self._last_number = number
         self._arrived, self._silent = time.monotonic(), False
         return True
@@ -172,29 +163,28 @@ class StreamBridge:
 
     def _look_after(self) -> None:
         """Look whether the stream is there and the same, and report when it has stalled."""
-        follower = self._follower
-        if follower.look() is not None:
+        if self.look() is not None:
             return
-        if follower.source is None:
+        if self.source is None:
             time.sleep(_LOOK_S)
         elif not self._silent and time.monotonic() - self._arrived > STALL_S:
             lives = {True: ", which made it, is alive", False: ", which made it, has ended", None: ""}
-            maker = f"{follower.source.maker}{lives[follower.source.maker_lives()]}"
-            follower.say(f"no frame for {STALL_S:g} s; {maker}")
+            maker = f"{self.source.maker}{lives[self.source.maker_lives()]}"
+            self.say(f"no frame for {STALL_S:g} s; {maker}")
             self.counters.stalls += 1
             self._silent = True
 
-    def _prepare(self, source: Stream) -> None:
+    def prepare(self, source: Stream) -> None:
         """Make a ring of a stream's shape and type, unless there is one."""
         self._last_number, self._silent = -1, True
         ring, (rows, columns), dtype = self._ring, source.shape, ring_type(source.dtype)
         if ring is None:  # publications before the first contact are not missed
-            self._follower.seen = source.count
+            self.seen = source.count
         elif (ring.shape, ring.dtype) == (source.shape, dtype):
             return
         else:
             ring.close()
-        self._ring = PixelRing.create(self.name, (rows, columns), dtype, slots=self._slots)
+        self._ring = PixelRing.create(self.name, (rows, columns), dtype)
 
 
 def _no_frames(shape: tuple[int, ...], dtype: np.dtype[np.generic]) -> str:
@@ -204,7 +194,6 @@ def _no_frames(shape: tuple[int, ...], dtype: np.dtype[np.generic]) -> str:
 
 LARGEST_NM = 1e6
 """Largest accepted command [nm]; the mirror keeps its commands if any is larger."""
-_READ_S = 1e-3  # to wait for a writer in the middle of a publication
 
 
 @dataclass(slots=True)
@@ -215,7 +204,7 @@ class CommandCounters(StreamCounters):
     """Commands that were not finite or exceeded `LARGEST_NM`."""
 
 
-class CommandStream:
+class CommandStream(Follower):
     """Commands of a mirror: the newest complete ones of a stream, zeros before the first.
 
     While the stream is missing or unusable, the mirror keeps its commands.
@@ -243,33 +232,20 @@ class CommandStream:
         When pyshmem is not installed.
     """
 
+    counters: CommandCounters
+    holds = "commands"
+
     def __init__(self, stream: str, commands: int, say: Callable[[str], None]) -> None:
-        self.stream, self.counters = stream, CommandCounters()
-        self._follower = Follower(
-            stream,
-            say,
-            self._incompatible,
-            lambda: self._keeps,
-            holds="commands",
-            counters=self.counters,
-        )
+        super().__init__(stream, say, self._not_for_the_mirror)
+        self.counters = CommandCounters()
         self.commands_nm: NDArray[np.float64] = np.zeros(commands)
         self.frame, self._refuses = -1, False
 
-    @property
-    def state(self) -> str:
-        """Reason why the stream cannot be read; "" if it can."""
-        return self._follower.obstacle
-
-    def take(self) -> None:
+    def update(self) -> None:
         """Apply the newest commands."""
-        publication = self._follower.newest(_READ_S, _LOOK_S)
+        publication = self.newest(_LOOK_S)
         if publication is not None:
             self._apply(publication)
-
-    def close(self) -> None:
-        """Close the stream."""
-        self._follower.close()
 
     def _apply(self, publication: Publication) -> None:
         """Take commands, unless they are out of range."""
@@ -281,21 +257,22 @@ class CommandStream:
             return
         self.counters.refused += 1
         if not self._refuses:
-            self._follower.say(f"commands that are not finite or exceed {LARGEST_NM:g} nm; {self._keeps}")
+            self.say(f"commands that are not finite or exceed {LARGEST_NM:g} nm; {self.meanwhile}")
         self._refuses = True
 
     @property
-    def _keeps(self) -> str:
+    def meanwhile(self) -> str:
+        """See `Follower`."""
         taken = self.counters.taken
         return f"the mirror {'keeps its last commands' if taken else 'stays flat'}"
 
-    def _incompatible(self, shape: tuple[int, ...], dtype: np.dtype[np.generic]) -> str:
+    def _not_for_the_mirror(self, shape: tuple[int, ...], dtype: np.dtype[np.generic]) -> str:
         """Return the expected shape and type, or "" if these are the mirror's commands."""
         expected = self.commands_nm.shape
         return "" if shape == expected and dtype.kind in "iuf" else f"{expected} real numbers, nm"
 
 
-class StreamOut:
+class StreamOut(Follower):
     """Republication of a stream of the engine for other programs.
 
     Parameters
@@ -306,10 +283,6 @@ class StreamOut:
         isio:NAME.
     say : function, optional
         Called with a one-line message when the stream changes.
-
-    Attributes
-    ----------
-    counters : StreamCounters
 
     Raises
     ------
@@ -323,10 +296,9 @@ class StreamOut:
         name = image_name(target)
         if name is None:
             raise InputError(f"{target}: expected isio:NAME (pyshmem programs can read {stream})")
+        super().__init__(stream, say, _no_commands)
         self._target = name
-        self._follower = Follower(stream, say or (lambda _: None), _no_commands, prepare=self._prepare)
         self._writer: ImageStreamWriter | None = None
-        self.counters = self._follower.counters
 
     def run(self, stop: StopEvent) -> None:
         """Pass publications on until `stop` is set.
@@ -344,10 +316,9 @@ class StreamOut:
 
     def step(self) -> bool:
         """Follow the stream for a moment; return whether something was passed on."""
-        follower = self._follower
-        if not follower.wait(_PARK_S):
+        if not self.wait(_PARK_S):
             return False
-        publication = follower.take(_PARK_S)
+        publication = self.take(_PARK_S)
         if publication is None:
             return False
         not_none(self._writer).publish(publication.values, publication.number)
@@ -356,13 +327,13 @@ class StreamOut:
 
     def close(self) -> None:
         """Close the engine's stream and remove the target."""
-        self._follower.close()
+        super().close()
         if self._writer is not None:
             with contextlib.suppress(OSError):
                 self._writer.close()
             self._writer = None
 
-    def _prepare(self, source: Stream) -> None:
+    def prepare(self, source: Stream) -> None:
         """Make the target, unless it exists with that number of values."""
         writer = self._writer
         if writer is not None and writer.shape[-1:] == source.shape:
@@ -370,7 +341,7 @@ class StreamOut:
         if writer is not None:
             writer.close()
         self._writer = ImageStreamWriter(self._target, source.shape)
-        self._follower.say(f"passed on as isio:{self._writer.path}")
+        self.say(f"passed on as isio:{self._writer.path}")
 
 
 def _no_commands(shape: tuple[int, ...], dtype: np.dtype[np.generic]) -> str:

@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
 
 from faintspot.base.errors import InputError
 from faintspot.engine.streams.shared_streams import (
@@ -66,15 +66,16 @@ class SlopeStreams:
         stream = f"{name}_commands"
         self.held_commands = commands_left_behind(stream, commands) if commands else None
         with ExitStack() as undo:
-            self._slopes = create_stream(f"{name}_slopes", (2 * n,))
-            undo.callback(self._slopes.unlink)
-            self._rehearsal = create_stream(f"{name}_rehearsal", (2 * n,))
-            undo.callback(self._rehearsal.unlink)
-            self._details = create_stream(f"{name}_details", (len(DETAILS), n))
-            undo.callback(self._details.unlink)
-            self._marks = create_stream(f"{name}_marks", (len(MARKS),), np.int64)
-            undo.callback(self._marks.unlink)
-            self._commands = create_stream(stream, (commands,)) if commands else None
+
+            def made(what: str, *shape: int, dtype: DTypeLike = np.float32) -> Any:
+                new = create_stream(f"{name}_{what}", shape, dtype)
+                undo.callback(new.unlink)
+                return new
+
+            self._slopes, self._rehearsal = made("slopes", 2 * n), made("rehearsal", 2 * n)
+            self._details = made("details", len(DETAILS), n)
+            self._marks = made("marks", len(MARKS), dtype=np.int64)
+            self._commands = made("commands", commands) if commands else None
             undo.pop_all()
         self._of_commands = stream, (commands,)
         self._generation = generation(stream)

@@ -16,6 +16,7 @@ from faintspot.engine.streams.shared_streams import lock_file, pyshmem_module
 from faintspot.io.telemetry import left_out
 
 _NAP_S = 5e-4
+_READ_S = 1e-3  # to wait for a writer in the middle of a publication
 
 
 class Stream(Protocol):
@@ -197,22 +198,17 @@ class Follower:
 
     Parameters
     ----------
-    name : str
+    stream : str
+        Name of the stream.
     say : function, optional
         Called with a one-line message when the stream changes.
     incompatible : function, optional
         Takes shape and type; returns what was expected instead, "" if they fit. Default: everything fits.
-    meanwhile : function, optional
-        Returns what is done without a stream, for messages.
-    holds : str
-        What the stream holds, for messages.
-    prepare : function, optional
-        Called with a stream that was opened, before that is said.
-    counters : StreamCounters, optional
-        Counts what `look` and `take` find.
 
     Attributes
     ----------
+    counters : StreamCounters
+        What `look` and `take` found.
     source : Stream or None
     obstacle : str
         Why there is no stream; "" if there is one.
@@ -223,28 +219,34 @@ class Follower:
         closed is unmapped at once. Those who hold it take `source` anew.
     """
 
+    holds = "values"
+    """What the stream holds, for messages."""
+
     def __init__(
         self,
-        name: str,
-        say: Callable[[str], None] = lambda text: None,
+        stream: str,
+        say: Callable[[str], None] | None = None,
         incompatible: Callable[[tuple[int, ...], np.dtype[np.generic]], str] = lambda shape, dtype: "",
-        meanwhile: Callable[[], str] = lambda: "waiting",
-        holds: str = "values",
-        prepare: Callable[[Stream], object] = lambda source: None,
-        counters: StreamCounters | None = None,
     ) -> None:
-        check_stream(name)
-        self.name, self._say, self._incompatible, self._meanwhile = name, say, incompatible, meanwhile
-        self._holds, self._prepare = holds, prepare
+        check_stream(stream)
+        self.stream, self._say, self._incompatible = stream, say or (lambda text: None), incompatible
         self.source: Stream | None = None
         self.using = threading.Lock()
         self.obstacle = "is not there"
-        self.counters = StreamCounters() if counters is None else counters
+        self.counters = StreamCounters()
         self.seen, self._reported, self._next_look_s = 0, "", -math.inf
 
     def say(self, text: str) -> None:
         """Report a change of the stream."""
-        self._say(f"stream {self.name}: {text}")
+        self._say(f"stream {self.stream}: {text}")
+
+    @property
+    def meanwhile(self) -> str:
+        """What is done without a stream, for messages."""
+        return "waiting"
+
+    def prepare(self, source: Stream) -> None:
+        """Get ready for a stream that was opened, before that is said."""
 
     def look(self, period_s: float = 0.0) -> Stream | None:
         """Close a stream that was removed or recreated, and open a missing one, at most once in `period_s`.
@@ -263,16 +265,16 @@ class Follower:
             if same:
                 return None
             self.counters.restarts += 1
-            self.close()
+            self._let_go()
             self.say("was removed" if same is None else "was recreated")
         self.obstacle = self._opened()
         if self.obstacle != self._reported and self.obstacle:
-            self.say(f"{self.obstacle}; {self._meanwhile()}")
+            self.say(f"{self.obstacle}; {self.meanwhile}")
         self._reported = self.obstacle
         source = self.source
         if source is not None:
-            self._prepare(source)
-            self.say(f"{' x '.join(map(str, source.shape))} {self._holds} ({source.dtype}), {source.maker}")
+            self.prepare(source)
+            self.say(f"{' x '.join(map(str, source.shape))} {self.holds} ({source.dtype}), {source.maker}")
         return source
 
     def take(self, limit_s: float, out: NDArray[np.generic] | None = None) -> Publication | None:
@@ -301,20 +303,20 @@ class Follower:
             time.sleep(limit_s)
         return False
 
-    def newest(self, limit_s: float = 1e-3, period_s: float = 1.0) -> Publication | None:
+    def newest(self, period_s: float = 1.0) -> Publication | None:
         """Return what `take` gives; without, look for the stream at most once in `period_s`.
 
         So a stream that was removed is read as long as its writer goes on.
         """
-        publication = self.take(limit_s)
+        publication = self.take(_READ_S)
         if publication is None and self.look(period_s) is not None:
-            return self.take(limit_s)
+            return self.take(_READ_S)
         return publication
 
     def _opened(self) -> str:
         """Open the stream; return the reason if that fails, else ""."""
         try:
-            source = open_stream(self.name)
+            source = open_stream(self.stream)
         except FileNotFoundError:
             return "is not there"
         except IncompatibleStreamError as error:
@@ -328,6 +330,9 @@ class Follower:
 
     def close(self) -> None:
         """Close the stream."""
+        self._let_go()
+
+    def _let_go(self) -> None:
         source, self.source = self.source, None
         if source is not None:
             with self.using:

@@ -81,11 +81,6 @@ def quantities(telemetry: Telemetry) -> dict[str, Floats]:
     }
 
 
-def methods_in_turn(telemetry: Telemetry, values: Floats) -> list[MethodDifference]:
-    """Compare the methods in a number for each frame; see `compared_methods`."""
-    return compared_methods(telemetry.method, method_names(telemetry), values)
-
-
 def compared_methods(
     methods: NDArray[np.int64], names: Sequence[str], values: Floats
 ) -> list[MethodDifference]:

@@ -13,9 +13,9 @@ from faintspot.base.report.plots import GREY, METHOD_COLOURS, Line, Panel
 from faintspot.base.report.texts import Texts
 from faintspot.engine.telemetry.numbers import (
     change_rows,
+    compared_methods,
     gaps,
     method_names,
-    methods_in_turn,
     quantities,
     restarts,
     timing,
@@ -127,10 +127,11 @@ def _timing(telemetry: Telemetry) -> Section:
 
 
 def _compared(telemetry: Telemetry) -> Section:
+    names = method_names(telemetry)
     records = [
-        {"quantity": name, **vars(each)}
-        for name, values in quantities(telemetry).items()
-        for each in methods_in_turn(telemetry, values)
+        {"quantity": quantity, **vars(each)}
+        for quantity, values in quantities(telemetry).items()
+        for each in compared_methods(telemetry.method, names, values)
     ]
     return _TEXT.section("methods", _TEXT.table("methods", records, first=records[0]["method"]))
 

@@ -15,7 +15,7 @@ import struct
 import time
 from collections.abc import Mapping, Sequence
 from operator import attrgetter
-from typing import Any, TypedDict, Unpack
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -117,19 +117,6 @@ _VALUES = attrgetter(*_OF_SLOPES)
 _RECORD_BYTES, _IMAGE_BYTES = 1 << 25, 1 << 24  # small enough for a container's 64 MiB of shared memory
 
 
-class Described(TypedDict, total=False):
-    """Values of an engine for the readers of its telemetry."""
-
-    settings: str
-    """Initial settings: TOML text (`faintspot.slopes.pipeline.configuration.to_text`)."""
-    methods: Sequence[str]
-    """Names of the interleaved configurations."""
-    reference: ArrayLike | None
-    """Reference slopes that were subtracted, (2 n,) [px]."""
-    control: Mapping[str, object] | None
-    """Interaction matrix and options (`faintspot.loop.control.configuration.packed_control`)."""
-
-
 class TelemetryRing(Segment):
     """An engine's telemetry, made by `create` (the writer) or `attach` (a reader).
 
@@ -188,7 +175,7 @@ class TelemetryRing(Segment):
         commands: int = 0,
         records: int | None = None,
         image_slots: int | None = None,
-        **described: Unpack[Described],
+        **described: object,
     ) -> TelemetryRing:
         """Create the rings of an engine.
 
@@ -205,7 +192,9 @@ class TelemetryRing(Segment):
         image_slots : int, optional
             Number of images. Default: as many as fit into 16 MiB, 2 to 16.
         **described
-            Values of `Described`; default: none.
+            Values for the readers: `settings`, the initial ones as TOML text; `methods`, names of the
+            interleaved configurations; `reference`, the reference slopes that were subtracted, (2 n,) [px];
+            `control`, as `packed_control` returns it.
 
         Raises
         ------
@@ -219,15 +208,13 @@ class TelemetryRing(Segment):
         if image_slots is None:
             size = image_type(layout.frame_shape, n, layout.window).itemsize
             image_slots = min(16, max(2, _IMAGE_BYTES // size))
-        reference = described.get("reference")
         description = {
             "settings": "",
-            "control": None,
+            "methods": [],
+            **dict.fromkeys(("reference", "control")),
             **described,
             "layout": layout_values(layout),
-            "methods": list(described.get("methods", ())),
             "commands": commands,
-            "reference": None if reference is None else np.asarray(reference).tolist(),
             "records": int(number_between("records", records, 2, 1 << 24, integer=True)),
             "image_slots": int(number_between("image_slots", image_slots, 2, 1 << 16, integer=True)),
         }
