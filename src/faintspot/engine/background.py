@@ -133,8 +133,9 @@ class BackgroundLearning:
         _, delay, unknown = known_delay(loop)
         if unknown:
             delay = replace(delay, gain=self._control.model.centroid_gain)
-        anew = self._last is None or self._count % _FROM_NOTHING_EVERY == 0
-        start = None if anew or self._last is None else self._last.learnt.identified
+        start = None
+        if self._last is not None and self._count % _FROM_NOTHING_EVERY:
+            start = self._last.learnt.identified
         self._last = relearnt = relearn(
             self._control.plant,
             self._control.model,
@@ -145,15 +146,14 @@ class BackgroundLearning:
             None if unknown else delay,
         )
         self._count += 1
-        new = relearnt.learnt if relearnt.is_better else None
         with tempfile.TemporaryDirectory(prefix="faintspot-models-") as folder:
-            model = None if new is None else f"{folder}/model.npz"
-            if new is not None and model is not None:
-                new.save(model)
+            model = f"{folder}/model.npz" if relearnt.is_better else None
+            if model is not None:
+                relearnt.learnt.save(model)
             found = relearnt.summary()
             request(self._path, "learnt", timeout_s=LENGTHY_TIMEOUT_S, model=model, found=found)
-        if new is not None:
-            self._control = self._control.with_model(new)
+        if relearnt.is_better:
+            self._control = self._control.with_model(relearnt.learnt)
         return relearnt, relearnt.is_better
 
     def _prior_std_px(self) -> NDArray[np.float64] | None:

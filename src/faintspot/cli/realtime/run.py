@@ -188,15 +188,10 @@ def run(
     control = None if no_control else load_control(described)
     if close_loop and control is None:
         raise InputError(f"--close-loop: expected [control] in {config}, which says what makes commands")
+    reference = None if control is None else control.reference
     engine = Engine(
         name,
-        PipelineMaker(
-            layout,
-            described.calibration,
-            described.psf,
-            described.score,
-            None if control is None else control.reference,
-        ),
+        PipelineMaker(layout, described.calibration, reference=reference, **described.spot),
         settings,
         EngineOptions(cpus=cpus, deadline_s=deadline_us * 1e-6, **options),
         source=None if stream is None else _followed(stream, name),
