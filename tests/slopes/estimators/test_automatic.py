@@ -194,8 +194,5 @@ def test_arguments_out_of_range_are_refused(function: Callable[..., Any]) -> Non
     )
     with refused("broadcast"):
         good(flux_e=[1.0, 2.0], read_noise_e=[1.0, 2.0, 3.0])
-
-
-def test_a_method_without_a_rule_is_refused() -> None:
-    with refused("method"):
-        automatic_kept_pixels(100.0, 1.0, pixels=256, spot_fwhm_px=2.0, method="median")
+    kept = partial(automatic_kept_pixels, 100.0, 1.0, pixels=256, spot_fwhm_px=2.0)
+    assert_each_refused(kept, method=["median"])

@@ -1,3 +1,5 @@
+from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -5,11 +7,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from tests import naive
-from tests.refusals import refused
+from tests.refusals import assert_each_refused, refused
 from tests.slopes.estimators.image_cases import BAD_IMAGES, images
 
 import faintspot as fs
 from faintspot.slopes.estimators.centroid import like_most, seen_spots
+from faintspot.slopes.estimators.noise import pixel_noise
 from faintspot.slopes.simulate import Detector, subapertures
 
 every_dtype = pytest.mark.parametrize("dtype", [np.float32, np.float64])
@@ -77,9 +80,19 @@ def test_lists_and_integers() -> None:
 
 
 @pytest.mark.parametrize(("bad", "words"), BAD_IMAGES)
-def test_centre_of_gravity_refuses_bad_images(bad: Any, words: str) -> None:
+@pytest.mark.parametrize(
+    "function",
+    [
+        fs.centre_of_gravity,
+        partial(fs.brightest_pixels, keep=1),
+        partial(fs.tv_denoise, noise_std=0.5),
+        pixel_noise,
+        seen_spots,
+    ],
+)
+def test_bad_images_are_refused(function: Callable[[Any], Any], bad: Any, words: str) -> None:
     with refused("images", words):
-        fs.centre_of_gravity(bad)
+        function(bad)
 
 
 RULES = ("subtract_next", "threshold", "subtract_kth")
@@ -137,17 +150,6 @@ def test_one_number_per_image_and_leading_shapes(rule: str) -> None:
             assert np.array_equal(together[i, j], fs.brightest_pixels(g[i, j], keep[j], rule=rule))
 
 
-@pytest.mark.parametrize(("bad", "words"), BAD_IMAGES)
-def test_brightest_pixels_refuse_bad_images(bad: Any, words: str) -> None:
-    with refused("images", words):
-        fs.brightest_pixels(bad, 1)
-
-
-def test_brightest_pixels_of_one_pixel_are_refused() -> None:
-    with refused("images", "at least 2 pixels"):
-        fs.brightest_pixels(np.ones((3, 1, 1)), 1)
-
-
 @pytest.mark.parametrize(
     ("keep", "words"),
     [
@@ -170,17 +172,13 @@ def test_numbers_of_pixels_out_of_range_are_refused(keep: Any, words: str) -> No
 
 
 def test_most_that_each_rule_keeps() -> None:
-    g = np.eye(4)
     for rule in ("threshold", "subtract_kth"):
-        fs.brightest_pixels(g, 16, rule=rule)
-        with refused("keep", "1 to 16"):
-            fs.brightest_pixels(g, 17, rule=rule)
-
-
-@pytest.mark.parametrize("rule", ["max", None, 1, ["threshold"]])
-def test_unknown_rule_is_refused(rule: Any) -> None:
-    with refused("rule", "'subtract_next', 'threshold', 'subtract_kth'"):
-        fs.brightest_pixels(np.eye(4), 3, rule=rule)
+        fs.brightest_pixels(np.eye(4), 16, rule=rule)
+        assert_each_refused(partial(fs.brightest_pixels, np.eye(4), rule=rule), keep=[17])
+    unknown = ["max", None, 1, ["threshold"]]
+    assert_each_refused(partial(fs.brightest_pixels, np.eye(4), 3), rule=unknown)
+    with refused("images", "at least 2 pixels"):
+        fs.brightest_pixels(np.ones((3, 1, 1)), 1)
 
 
 @pytest.mark.parametrize(
@@ -207,12 +205,7 @@ def test_width_and_flux_wherever_the_spots_are(flux_e: float, read_noise_e: floa
 
 
 def test_images_without_spots_are_refused() -> None:
-    with refused("images", "found none"):
-        seen_spots(np.ones((5, 8, 8)))
-    with refused("images", "4 x 4"):
-        seen_spots(np.ones((5, 8, 3)))
-    with refused("images"):
-        seen_spots(np.full((5, 8, 8), np.nan))
+    assert_each_refused(seen_spots, images=[np.ones((5, 8, 8)), np.ones((5, 8, 3))])
 
 
 @pytest.mark.parametrize("flux_e", [30.0, 500.0, 1e5])

@@ -277,9 +277,8 @@ def estimator(text: str) -> str:
     return f'[estimator]\nname = "tv"\n{text}'
 
 
-@pytest.mark.parametrize(
-    ("words", "text"),
-    [
+DAMAGED: dict[Any, list[tuple[str, str]]] = {
+    fs.Settings: [
         ("setings: unknown table; did you mean settings?", "[setings]\n"),
         ("colours: unknown table; known: layout, calibration, estimator, settings", "[colours]\n"),
         ("expected a table [estimator], found layout", LAYOUT),
@@ -300,16 +299,7 @@ def estimator(text: str) -> str:
         ),
         ("not a TOML file", "[settings\nnoise_std = 1"),
     ],
-)
-def test_damaged_settings_are_refused(words: str, text: str, tmp_path: Path) -> None:
-    path = written(tmp_path, text)
-    with refused(f"{path}: ", words):
-        fs.Settings.load(path)
-
-
-@pytest.mark.parametrize(
-    ("words", "text"),
-    [
+    fs.Layout: [
         ("layout.frame_shape: expected a value, found none", "[layout]\nwindow = 4"),
         (
             "layout.window = 1: expected a number from 2 to 64",
@@ -322,16 +312,7 @@ def test_damaged_settings_are_refused(words: str, text: str, tmp_path: Path) -> 
         ("layout.grid.outer_radus: unknown key; did you mean outer_radius?", f"{LAYOUT}outer_radus = 1"),
         ("layout.grid.outer_radius = 0.1", f"{LAYOUT}outer_radius = 0.1"),
     ],
-)
-def test_damaged_layout_is_refused(words: str, text: str, tmp_path: Path) -> None:
-    path = written(tmp_path, text)
-    with refused(f"{path}: {words}"):
-        fs.Layout.load(path)
-
-
-@pytest.mark.parametrize(
-    ("words", "text"),
-    [
+    fs.Calibration: [
         ("calibration.em_gain = 0: expected a number from 1e-09", "em_gain = 0"),
         ("calibration.drak: unknown key; did you mean dark?", "drak = 1.0"),
         ("absent.npy", 'dark = "absent.npy"'),
@@ -340,11 +321,16 @@ def test_damaged_layout_is_refused(words: str, text: str, tmp_path: Path) -> Non
         ("calibration.flat", "flat = 1.0"),
         ("calibration.saturation_adu", "saturation_adu = [1.0]"),
     ],
+}
+
+
+@pytest.mark.parametrize(
+    ("kind", "words", "text"), [(kind, *case) for kind, cases in DAMAGED.items() for case in cases]
 )
-def test_damaged_calibration_is_refused(words: str, text: str, tmp_path: Path) -> None:
-    path = written(tmp_path, f"[calibration]\n{text}\n")
+def test_damaged_files_are_refused(kind: Any, words: str, text: str, tmp_path: Path) -> None:
+    path = written(tmp_path, f"[calibration]\n{text}\n" if kind is fs.Calibration else text)
     with refused(f"{path}: ", words):
-        fs.Calibration.load(path)
+        kind.load(path)
 
 
 def test_files_that_cannot_be_used(tmp_path: Path) -> None:

@@ -1,9 +1,9 @@
 """The running mean of the flux, and pipelines that are told it."""
 
-from typing import Any
+from functools import partial
 
 import numpy as np
-import pytest
+from tests.refusals import assert_each_refused
 
 import faintspot as fs
 from faintspot.slopes.estimators.built_in.window import Window
@@ -33,25 +33,6 @@ def test_is_a_value_and_skips_what_is_not_finite() -> None:
     assert later.flux_e.tolist() == [10.0, 30.0]
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (([np.nan],), "flux_e: expected finite"),
-        (([[[1.0]]],), "flux_e: expected shape"),
-        (([1.0], 0.5), "time_constant_frames = 0.5"),
-        (([1.0], 10.0, 0.0), "frames = 0"),
-    ],
-)
-def test_what_is_refused(arguments: Any, message: str) -> None:
-    with pytest.raises(fs.InputError, match=message):
-        fs.MeanFlux(*arguments)
-
-
-def test_updates_of_another_sensor_are_refused() -> None:
-    with pytest.raises(fs.InputError, match=r"expected shape \(2,\), got \(3,\)"):
-        fs.MeanFlux([1.0, 2.0]).updated(np.ones(3))
-
-
 def window_pipeline() -> fs.SlopePipeline:
     settings = fs.Settings(Window(window_fwhm_px=3.0), spot_fwhm_px=2.0)
     return fs.SlopePipeline(fs.Layout.grid((2, 3), pixels=8), settings, fs.Calibration(read_noise_e=1.0))
@@ -72,6 +53,12 @@ def test_the_same_pipeline_while_the_flux_is_steady() -> None:
     assert pipeline.with_flux(fs.MeanFlux(np.full(6, -3.0))).settings.flux_e.max() < 0.01
 
 
-def test_flux_of_another_sensor_is_refused() -> None:
-    with pytest.raises(fs.InputError, match="mean_flux: expected one number or 6"):
-        window_pipeline().with_flux(np.ones(5))
+def test_what_is_refused() -> None:
+    assert_each_refused(
+        partial(fs.MeanFlux, [1.0]),
+        time_constant_frames=[0.5],
+        frames=[0.0],
+    )
+    assert_each_refused(fs.MeanFlux, flux_e=[[np.nan], [[[1.0]]]])
+    assert_each_refused(fs.MeanFlux([1.0, 2.0]).updated, flux_e=[np.ones(3)])
+    assert_each_refused(window_pipeline().with_flux, mean_flux=[np.ones(5)])

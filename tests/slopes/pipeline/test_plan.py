@@ -31,21 +31,17 @@ class TestWhatIsMissing:
     @pytest.mark.parametrize(
         ("settings", "parts", "message"),
         [
-            (fs.Settings("ml"), {}, r"psf: expected a PSF .*learn_psf"),
-            (
-                fs.Settings("ml"),
-                {"calibration": None, "psf": fs.PSF.analytic()},
-                r"calibration\.read_noise_e",
-            ),
-            (fs.Settings("weighted"), {}, r"settings\.spot_fwhm_px"),
-            (fs.Settings(noise_std="auto"), {}, r"settings\.spot_fwhm_px"),
-            (fs.Settings("thresholded"), {}, r"estimator\.threshold_e"),
+            (fs.Settings("ml"), {}, "psf: expected a PSF"),
+            (fs.Settings("ml"), {"calibration": None, "psf": fs.PSF.analytic()}, "calibration.read_noise_e"),
+            (fs.Settings("weighted"), {}, "settings.spot_fwhm_px"),
+            (fs.Settings(noise_std="auto"), {}, "settings.spot_fwhm_px"),
+            (fs.Settings("thresholded"), {}, "estimator.threshold_e"),
         ],
     )
     def test_what_an_estimator_lacks_is_named(
         self, settings: fs.Settings, parts: dict[str, Any], message: str
     ) -> None:
-        with pytest.raises(fs.InputError, match=message):
+        with refused(message):
             fs.SlopePipeline(LAYOUT, settings, **{"calibration": NOISE, **parts})
 
 

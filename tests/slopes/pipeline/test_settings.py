@@ -47,21 +47,6 @@ class TestSettings:
         assert stated.values("tolerance", 2, 256).tolist() == [0.01, 0.0025]
         assert stated.values("max_iterations", 2, 256).tolist() == [480, 480]
 
-    @pytest.mark.parametrize(
-        ("words", "arguments"),
-        [
-            ("noise_std: expected a number (electrons)", {"noise_std": None}),
-            ("preset = 'slow': expected", {"preset": "slow"}),
-            (
-                "arrays of one length, got keep_brightest 3, noise_std 2",
-                {"noise_std": [1, 2], "keep_brightest": [1, 2, 3]},
-            ),
-        ],
-    )
-    def test_settings_out_of_range_are_refused(self, words: str, arguments: dict[str, Any]) -> None:
-        with refused(words):
-            fs.Settings(**{"noise_std": 1.0, **arguments})
-
 
 class TestReplace:
     base = fs.Settings(noise_std=1.0, keep_brightest=10)
@@ -112,10 +97,6 @@ class TestEstimators:
         assert by_name.model_error == 0.2
         assert repr(by_name) == "Settings('ml', model_error=0.2, search_range_px=2.0)"
 
-    def test_an_object_has_its_options_already(self) -> None:
-        with refused("model_error: give it to the estimator's own object"):
-            fs.Settings(MaximumLikelihood(), model_error=0.2)
-
     def test_options_are_those_of_the_estimator_and_the_shared_ones(self) -> None:
         settings = fs.Settings("thresholded", threshold_e=3.0)
         assert set(settings.declared()) == {"threshold_e", "flux_floor", *fs.Settings.SHARED}
@@ -129,15 +110,24 @@ class TestEstimators:
         [
             ("model_error: an option of 'ml' and 'map', not of 'weighted'", "weighted", {"model_error": 0.1}),
             ("modle_error: unknown option of 'ml'; did you mean model_error?", "ml", {"modle_error": 0.1}),
+            ("model_error: give it to the estimator's own object", MaximumLikelihood(), {"model_error": 0.2}),
+            ("noise_std: expected a number (electrons)", "tv", {}),
+            ("preset = 'slow': expected", "tv", {"noise_std": 1.0, "preset": "slow"}),
+            (
+                "arrays of one length, got model_error 2, flux_e 3",
+                "ml",
+                {"model_error": [0.1, 0.2], "flux_e": [1.0, 2.0, 3.0]},
+            ),
+            (
+                "arrays of one length, got keep_brightest 3, noise_std 2",
+                "tv",
+                {"noise_std": [1, 2], "keep_brightest": [1, 2, 3]},
+            ),
         ],
     )
-    def test_options_of_others_are_refused(self, words: str, estimator: Any, options: dict[str, Any]) -> None:
+    def test_what_is_refused(self, words: str, estimator: Any, options: dict[str, Any]) -> None:
         with refused(words):
             fs.Settings(estimator, **options)
-
-    def test_arrays_of_estimator_and_sensor_have_one_length(self) -> None:
-        with refused("arrays of one length, got model_error 2, flux_e 3"):
-            fs.Settings("ml", model_error=[0.1, 0.2], flux_e=[1.0, 2.0, 3.0])
 
     def test_another_estimator_keeps_what_it_has_too(self) -> None:
         tv = fs.Settings("tv", noise_std=2.0, keep_brightest=9, search_range_px=3.0, flux_e=[1.0, 2.0])
