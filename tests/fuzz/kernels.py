@@ -167,7 +167,7 @@ def _measured(
     groups = n_frames * -(-n // lanes.width)
     own = plan.own_scratch
     scratch = guard(new_scratch(lanes, *window, own(lanes, *window)))
-    if plan.needs_flux:
+    if plan.prepared.needs_flux:
         flux = guard(np.empty((n_frames, n), np.float32))
         plan.flux_kernel(frames)(source, 0, groups, scratch, flux)
         variants = plan.variants(flux.mean(axis=1, dtype=np.float64))

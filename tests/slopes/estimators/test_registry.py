@@ -132,7 +132,7 @@ class TestRegister:
             name: ClassVar[str] = "empty"
             label: ClassVar[str] = "empty"
 
-        with refused("estimator 'empty': expected a class with `locate` or `prepared`, got neither"):
+        with refused("estimator 'empty': expected a class with `locate` or `plan`, got neither"):
             fs.SlopePipeline(fs.Layout.grid((1, 2), pixels=8), fs.Settings("empty"))
 
 

@@ -75,7 +75,7 @@ class Estimator(Options):
     """Method that finds the position of the spot in a sub-aperture image.
 
     A subclass is a frozen dataclass (`@dataclass(frozen=True, eq=False, kw_only=True)`) whose fields are
-    its options, declared by `base.config.options.option`. It overrides `locate` (NumPy) or `prepared`
+    its options, declared by `base.config.options.option`. It overrides `locate` (NumPy) or `plan`
     (compiled kernel). Register it by name with `faintspot.slopes.estimators.register`, or, in an installed
     package, with the entry point group `faintspot.slopes.estimators`.
 
@@ -115,6 +115,8 @@ class Estimator(Options):
     """Whether slopes predicted by a control loop improve the estimate."""
     strength_option: ClassVar[str | None] = None
     """Option that is the strength of the denoising, as in the method `tv:0.6`."""
+    plan: ClassVar[type[EstimatorPlan] | None] = None
+    """Class of the tables that are computed for a sensor before the first frame; None if `locate` is used."""
 
     # Description ---------------------------------------------------------------------------------------
 
@@ -151,16 +153,6 @@ class Estimator(Options):
 
     # Preparation and measurement ----------------------------------------------------------------------
 
-    def prepared(self, sensor: Sensor) -> EstimatorPlan | None:
-        """Return the tables computed for a sensor before the first frame, or None if `locate` is used.
-
-        Raises
-        ------
-        InputError
-            If the options do not fit the sensor.
-        """
-        return None
-
     def locate(self, images: NDArray[np.float32], sensor: Sensor, prior: Floats) -> object:
         """Return the positions of the spots of one frame; override this in an estimator without a kernel.
 
@@ -177,7 +169,7 @@ class Estimator(Options):
         array (n, 2) or Positions
             x and y, px from the window centres. Values that are not finite are flagged and raise no error.
         """
-        raise NotImplementedError(f"{type(self).__name__}: expected an estimator with `locate` or `prepared`")
+        raise NotImplementedError(f"{type(self).__name__}: expected an estimator with `locate` or `plan`")
 
     def check(self, sensor: Sensor) -> None:
         """Raise an error if required knowledge about the sensor is missing.

@@ -68,7 +68,7 @@ class PythonPlan(EstimatorPlan):
         super().__init__(estimator, replace(sensor, zero=zero))
         if type(estimator).locate is Estimator.locate:
             raise InputError(
-                f"estimator {estimator.name!r}: expected a class with `locate` or `prepared`, got neither"
+                f"estimator {estimator.name!r}: expected a class with `locate` or `plan`, got neither"
             )
         self.found(typical_images(sensor.n, sensor.window), sensor.zero.copy())
 

@@ -99,12 +99,8 @@ class Sensor:
         """Variance [photo-electrons^2] of each dark pixel, shaped as `pixel_noise_e`; 0 if it is unknown."""
         if self.calibration.read_noise_e is None:
             return np.zeros((self.n, 1, 1))
-        return np.asarray(np.square(self.pixel_noise_e) + self.background_variance)
-
-    @property
-    def background_variance(self) -> float:
-        """Variance of the background in each pixel [photo-electrons^2]."""
-        return self.calibration.excess_noise * self.calibration.background_e
+        background = self.calibration.excess_noise * self.calibration.background_e
+        return np.asarray(np.square(self.pixel_noise_e) + background)
 
     @cached_property
     def spot_fwhm_px(self) -> Floats:

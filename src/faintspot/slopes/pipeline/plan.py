@@ -115,12 +115,12 @@ class Plan:
         )
         self.estimator: Estimator = settings.estimator
         self.estimator.check(self.sensor)
-        plan = self.estimator.prepared(self.sensor)
-        if plan is None:
+        kind = self.estimator.plan
+        if kind is None:
             from faintspot.slopes.estimators.python import PythonPlan  # few estimators are in Python
 
-            plan = PythonPlan(self.estimator, self.sensor)
-        self.prepared: EstimatorPlan = plan
+            kind = PythonPlan
+        self.prepared: EstimatorPlan = kind(self.estimator, self.sensor)
         self.variances: NDArray[np.float32] | None = None
         """Variance of each dark pixel for the kernel, if it differs: see `kernels.groups.Task`."""
         if self.sensor.has_noise_map:
@@ -137,13 +137,8 @@ class Plan:
         self._kernels: dict[tuple[object, str], Direct] = {}
         self._lock = threading.RLock()
         self._made: tuple[NDArray[np.float32], object, object] | None = None
-        if not self.needs_flux:
+        if not self.prepared.needs_flux:
             self._add(self.sensor.flux_e)
-
-    @property
-    def needs_flux(self) -> bool:
-        """Whether the flux is measured in every frame."""
-        return self.prepared.needs_flux
 
     @property
     def settings(self) -> NDArray[np.float32]:

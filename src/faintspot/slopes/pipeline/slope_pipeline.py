@@ -261,7 +261,7 @@ class SlopePipeline:
     @property
     def needs_flux(self) -> bool:
         """Whether settings follow the flux of each frame, which is measured first."""
-        return self.plan.needs_flux
+        return self.plan.prepared.needs_flux
 
     def fingerprint(self) -> bytes:
         """Return bytes that identify the pipeline: they differ if slopes of the same frame may differ."""
@@ -312,7 +312,7 @@ class SlopePipeline:
         """Return the calling thread's own way to measure frames of a small sensor; None if it is not one."""
         plan, lanes, window = self.plan, self._lanes, self.layout.window
         groups = -(-len(self.layout) // lanes.width)
-        simple = dtype in _SMALL_TYPES and not (plan.needs_flux or plan.prepared.in_python)
+        simple = dtype in _SMALL_TYPES and not (self.needs_flux or plan.prepared.in_python)
         if not simple or most_threads(groups, lanes, window, plan.estimator.cost) > 1:
             return None
         frames = np.empty((1, *self.layout.frame_shape), np.float32 if dtype.kind == "f" else np.uint16)

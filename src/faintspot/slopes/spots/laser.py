@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -258,17 +257,13 @@ class LaserGuideStar:
         """Return altitudes that are surely above the site."""
         return numbers_between("altitudes_m", altitudes_m, self.site_altitude_m + 1e3, 1e6)
 
-    @cached_property
-    def _gate(self) -> tuple[float, float]:
-        low, high = (0.0, np.inf) if self.range_gate_m is None else self.range_gate_m
-        return float(low), float(high)
-
     def _points(self, altitudes_m: Floats) -> tuple[Floats, Floats]:
         """Return `integration_points` so fine that no gaps show between the spots, within the gate."""
         steps = np.abs(np.diff(self.offsets_px(altitudes_m), axis=1)).max(initial=0.0)
         coarsest = _COARSEST_OF_FWHM * float(self.spot.fwhm_px.min())
         points, parts = integration_points(altitudes_m, max(2, math.ceil(steps / coarsest)))
-        let_through = (points >= self._gate[0]) & (points <= self._gate[1])
+        low, high = (0.0, np.inf) if self.range_gate_m is None else self.range_gate_m
+        let_through = (points >= low) & (points <= high)
         return points, parts * let_through[:, None]
 
     def _blocks(self, numbers: int) -> list[slice]:

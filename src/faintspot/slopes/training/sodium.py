@@ -186,9 +186,8 @@ def _fitted(
         shapes = flat @ density
         flux = np.maximum(measured.sum(axis=1) / np.maximum(shapes.sum(axis=1), 1e-3), 0.0)
         weights = _weights(flux, shapes, variance, measured, mean.frames)
-        flux = np.maximum(
-            _ratio((weights * shapes * measured).sum(axis=1), (weights * shapes**2).sum(axis=1)), 0.0
-        )
+        above, below = (weights * shapes * measured).sum(axis=1), (weights * shapes**2).sum(axis=1)
+        flux = np.maximum(np.divide(above, below, out=np.zeros_like(above), where=below > 0), 0.0)
         per_density = flux[:, None, None] * flat
         weighted = (weights[:, :, None] * per_density).reshape(-1, per_density.shape[-1])
         normal = weighted.T @ per_density.reshape(weighted.shape)
@@ -274,10 +273,6 @@ def _weights(flux: Floats, shapes: Floats, dark: Floats, measured: Floats, frame
     frames = not_none(frames)
     weights: Floats = frames / np.maximum(flux[:, None] * shapes + dark, least)
     return weights
-
-
-def _ratio(above: Floats, below: Floats) -> Floats:
-    return np.divide(above, below, out=np.zeros_like(above), where=below > 0)
 
 
 def _solved(normal: Floats, right: Floats, centred: Floats, second_difference: float) -> Floats:

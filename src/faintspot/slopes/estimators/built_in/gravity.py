@@ -204,6 +204,7 @@ class BrightestPixels(KeepingBrightest):
     method = "brightest pixels, centre of gravity"
     cost = 0.21
     style = Style("#000000", "--", "o")
+    plan = GravityPlan
     automatic_method = "none"
 
     def in_words(self, n_subapertures: int, pixels: int) -> str:
@@ -213,10 +214,6 @@ class BrightestPixels(KeepingBrightest):
     def denoised(self, images: NDArray[np.float32]) -> NDArray[np.float32]:
         """See `KeepingBrightest`."""
         return images
-
-    def prepared(self, sensor: Sensor) -> GravityPlan:
-        """See `Estimator`."""
-        return GravityPlan(self, sensor)
 
 
 @register
@@ -229,16 +226,21 @@ class CentreOfGravity(Centroid):
     method = "centre of gravity of the whole window"
     cost = 0.13
     style = Style("#666666", ":", "x")
+    plan = GravityPlan
     steps_shown = (RAW, CALIBRATED)
-
-    def prepared(self, sensor: Sensor) -> GravityPlan:
-        """See `Estimator`."""
-        return GravityPlan(self, sensor)
 
 
 _OF_NOISE = (3.0, 1.5, 2.0, 2.5, 4.0, 5.0)  # multiples of the noise of a dark pixel
 _OF_PEAK = (0.05, 0.1, 0.2, 0.3)  # for bright spots
 _SMALLEST_E = 0.01
+
+
+class _ThresholdedPlan(GravityPlan):
+    """Thresholds of a centre of gravity."""
+
+    def fill_flux(self, table: NDArray[np.float32], flux_e: Floats) -> None:
+        """See `EstimatorPlan`."""
+        table[gravity.LEVEL], table[gravity.SUBTRACT] = self.each("threshold_e"), 1.0
 
 
 @register
@@ -253,6 +255,7 @@ class Thresholded(Centroid):
     method = "centre of gravity of the flux above a threshold"
     cost = 0.15
     style = Style("#9a9a9a", ":", "X")
+    plan = _ThresholdedPlan
 
     def in_words(self, n_subapertures: int, pixels: int) -> str:
         """See `Estimator`."""
@@ -276,15 +279,3 @@ class Thresholded(Centroid):
             raise InputError(
                 f"estimator.threshold_e: expected a level (electrons) for estimator {self.name!r}, got none"
             )
-
-    def prepared(self, sensor: Sensor) -> GravityPlan:
-        """See `Estimator`."""
-        return _ThresholdedPlan(self, sensor)
-
-
-class _ThresholdedPlan(GravityPlan):
-    """Thresholds of a centre of gravity."""
-
-    def fill_flux(self, table: NDArray[np.float32], flux_e: Floats) -> None:
-        """See `EstimatorPlan`."""
-        table[gravity.LEVEL], table[gravity.SUBTRACT] = self.each("threshold_e"), 1.0

@@ -84,22 +84,6 @@ class Likelihood(Stepping):
         return {"blur_px": blurs, "model_error": list(_MODEL_ERRORS)}
 
 
-@register
-@dataclass(frozen=True, eq=False, kw_only=True)
-class MaximumLikelihood(Likelihood):
-    """Position and flux of maximum likelihood, by Fisher scoring."""
-
-    name = "ml"
-    label = "maximum likelihood"
-    method = "maximum likelihood for Poisson and Gaussian noise"
-    cost = 0.27
-    style = Style("#0072B2", "-", "P")
-
-    def prepared(self, sensor: Sensor) -> LikelihoodPlan:
-        """See `Estimator`."""
-        return LikelihoodPlan(self, sensor)
-
-
 class LikelihoodPlan(SpotPlan):
     """Tables of a weighted fit; pixels with low read noise are rounded to whole electrons."""
 
@@ -155,54 +139,22 @@ def _rounding_variance(noise_e: float) -> float:
     return math.erfc(0.5 / (noise_e * math.sqrt(2.0))) if noise_e > 0 else 0.0
 
 
+@register
+@dataclass(frozen=True, eq=False, kw_only=True)
+class MaximumLikelihood(Likelihood):
+    """Position and flux of maximum likelihood, by Fisher scoring."""
+
+    name = "ml"
+    label = "maximum likelihood"
+    method = "maximum likelihood for Poisson and Gaussian noise"
+    cost = 0.27
+    style = Style("#0072B2", "-", "P")
+    plan = LikelihoodPlan
+
+
 # Levels of measured flux, a tenth apart, for which memory must suffice: a factor of two. Fluxes beyond the
 # levels that fit use the tables of the nearest one.
 _LEVELS = 8
-
-
-@register
-@dataclass(frozen=True, eq=False, kw_only=True)
-class MaximumAPosteriori(Likelihood):
-    """Maximum likelihood with a prior centred on the reference position or on the predicted slope."""
-
-    prior_std_px: Value = option(
-        None,
-        "Standard deviation of the prior on the position. Default: no prior other than the search range.",
-        unit="px",
-        low=1e-6,
-        high=1e4,
-    )
-    preset: str = option(
-        "accurate",
-        'Number of steps if `steps` is not given: 3, or 2 with "fast".',
-        choices=PRESETS,
-        per_subaperture=False,
-    )
-
-    name = "map"
-    label = "maximum a posteriori"
-    method = "maximum likelihood with a prior on the position"
-    cost = 0.6
-    style = Style("#56B4E9", "-", "*")
-    takes_prior = True
-    usual_steps: ClassVar[Mapping[str, int]] = {"accurate": 3, "fast": 2}
-
-    @property
-    def uses_flux(self) -> bool:
-        """See `Estimator`."""
-        return True
-
-    def for_scene(self, scene: Scene) -> Self:
-        """Set the prior to the standard deviation of positions distributed uniformly within their range."""
-        return super().for_scene(scene).replaced({"prior_std_px": scene.position_range_px / math.sqrt(3)})
-
-    def for_bright_flux(self) -> Self:
-        """Remove the prior."""
-        return super().for_bright_flux().replaced({"prior_std_px": None})
-
-    def prepared(self, sensor: Sensor) -> LikelihoodPlan:
-        """See `Estimator`."""
-        return _MaximumAPosterioriPlan(self, sensor)
 
 
 class _MaximumAPosterioriPlan(LikelihoodPlan):
@@ -285,3 +237,45 @@ class _MaximumAPosterioriPlan(LikelihoodPlan):
         columns = [self.psf.index_of(sensor.n), flux_e, self.each("weight_floor"), noise]
         kinds, which = np.unique(np.column_stack(columns), axis=0, return_inverse=True)
         return kinds, which.reshape(-1)
+
+
+@register
+@dataclass(frozen=True, eq=False, kw_only=True)
+class MaximumAPosteriori(Likelihood):
+    """Maximum likelihood with a prior centred on the reference position or on the predicted slope."""
+
+    prior_std_px: Value = option(
+        None,
+        "Standard deviation of the prior on the position. Default: no prior other than the search range.",
+        unit="px",
+        low=1e-6,
+        high=1e4,
+    )
+    preset: str = option(
+        "accurate",
+        'Number of steps if `steps` is not given: 3, or 2 with "fast".',
+        choices=PRESETS,
+        per_subaperture=False,
+    )
+
+    name = "map"
+    label = "maximum a posteriori"
+    method = "maximum likelihood with a prior on the position"
+    cost = 0.6
+    style = Style("#56B4E9", "-", "*")
+    plan = _MaximumAPosterioriPlan
+    takes_prior = True
+    usual_steps: ClassVar[Mapping[str, int]] = {"accurate": 3, "fast": 2}
+
+    @property
+    def uses_flux(self) -> bool:
+        """See `Estimator`."""
+        return True
+
+    def for_scene(self, scene: Scene) -> Self:
+        """Set the prior to the standard deviation of positions distributed uniformly within their range."""
+        return super().for_scene(scene).replaced({"prior_std_px": scene.position_range_px / math.sqrt(3)})
+
+    def for_bright_flux(self) -> Self:
+        """Remove the prior."""
+        return super().for_bright_flux().replaced({"prior_std_px": None})

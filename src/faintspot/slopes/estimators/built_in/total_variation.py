@@ -1,5 +1,7 @@
 """Total-variation denoising (the method of the paper) or Gaussian smoothing, then brightest pixels."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -17,13 +19,38 @@ from faintspot.slopes.estimators.base import BACKGROUND, CALIBRATED, RAW, Estima
 from faintspot.slopes.estimators.built_in.gravity import Floats, GravityPlan, KeepingBrightest
 from faintspot.slopes.estimators.noise import ALGORITHMS, suggested_strength, tv_denoise
 from faintspot.slopes.estimators.registry import register
-from faintspot.slopes.estimators.sensor import Scene, Sensor
+from faintspot.slopes.estimators.sensor import Scene
 from faintspot.slopes.kernels import gravity
 from faintspot.slopes.kernels.flat_start import flat_start_table
 
 _STRENGTHS = (1.0, 0.4, 0.6, 0.8, 1.25)  # multiples of the automatic strength
 _LEAST_STRENGTH_E = 1e-3
 _LIMITS = "tolerance", "max_iterations"
+
+
+class _TotalVariationPlan(GravityPlan):
+    """Strengths, and the starting point of the denoising."""
+
+    estimator: TotalVariation
+
+    @cached_property
+    def tables(self) -> gravity.GravityTables:
+        """See `GravityPlan`."""
+        return gravity.GravityTables(
+            flat_start_table(*self.sensor.window), ALGORITHMS[self.estimator.algorithm]
+        )
+
+    def fill(self, table: NDArray[np.float32]) -> None:
+        """See `EstimatorPlan`."""
+        super().fill(table)
+        table[gravity.TOLERANCE], table[gravity.LIMIT] = self.each("tolerance"), self.each("max_iterations")
+
+    def fill_flux(self, table: NDArray[np.float32], flux_e: Floats) -> None:
+        """See `EstimatorPlan`."""
+        super().fill_flux(table, flux_e)
+        automatic = is_auto(self.estimator.noise_std)
+        strength = automatic_strength(**self.rule_arguments(flux_e)) if automatic else self.each("noise_std")
+        table[gravity.STRENGTH] = strength
 
 
 @register
@@ -72,6 +99,7 @@ class TotalVariation(KeepingBrightest):
     method = "total-variation denoising, brightest pixels, centre of gravity"
     cost = 0.71
     style = Style("#D55E00", "-", "s")
+    plan = _TotalVariationPlan
     steps_shown = (RAW, CALIBRATED, Step("denoised", "denoised"), BACKGROUND)
     automatic_method = "tv"
     strength_option = "noise_std"
@@ -149,38 +177,21 @@ class TotalVariation(KeepingBrightest):
         )
         return result
 
-    def prepared(self, sensor: Sensor) -> GravityPlan:
-        """See `Estimator`."""
-        return _TotalVariationPlan(self, sensor)
+
+_USUAL_PX = 0.7
+_WIDTHS = (1.0, 0.6, 0.8, 1.3, 1.7)  # multiples of the automatic width
 
 
-class _TotalVariationPlan(GravityPlan):
-    """Strengths, and the starting point of the denoising."""
-
-    estimator: TotalVariation
+class _SmoothedPlan(GravityPlan):
+    """Tables of a smoothing followed by a centre of gravity."""
 
     @cached_property
     def tables(self) -> gravity.GravityTables:
         """See `GravityPlan`."""
-        return gravity.GravityTables(
-            flat_start_table(*self.sensor.window), ALGORITHMS[self.estimator.algorithm]
-        )
+        from faintspot.slopes.estimators.spot_tables import gaussian_taps
 
-    def fill(self, table: NDArray[np.float32]) -> None:
-        """See `EstimatorPlan`."""
-        super().fill(table)
-        table[gravity.TOLERANCE], table[gravity.LIMIT] = self.each("tolerance"), self.each("max_iterations")
-
-    def fill_flux(self, table: NDArray[np.float32], flux_e: Floats) -> None:
-        """See `EstimatorPlan`."""
-        super().fill_flux(table, flux_e)
-        automatic = is_auto(self.estimator.noise_std)
-        strength = automatic_strength(**self.rule_arguments(flux_e)) if automatic else self.each("noise_std")
-        table[gravity.STRENGTH] = strength
-
-
-_USUAL_PX = 0.7
-_WIDTHS = (1.0, 0.6, 0.8, 1.3, 1.7)  # multiples of the automatic width
+        std = np.repeat(self.each("smoothing_px")[:, None], 2, axis=1)
+        return gravity.GravityTables(taps=gaussian_taps(std, self.sensor.window))
 
 
 @register
@@ -202,6 +213,7 @@ class Smoothed(KeepingBrightest):
     method = "linear Gaussian smoothing, brightest pixels, centre of gravity"
     cost = 0.22
     style = Style("#E69F00", "-", "D")
+    plan = _SmoothedPlan
     steps_shown = (RAW, CALIBRATED, Step("smoothed", "denoised"), BACKGROUND)
     automatic_method = "smoothed"
     strength_option = "smoothing_px"
@@ -227,19 +239,3 @@ class Smoothed(KeepingBrightest):
         width = float(self.values("smoothing_px", 1, images[0].size)[0])
         smoothed: NDArray[np.float32] = gaussian_filter(images, width, mode="constant", axes=(-2, -1))
         return smoothed
-
-    def prepared(self, sensor: Sensor) -> GravityPlan:
-        """See `Estimator`."""
-        return _SmoothedPlan(self, sensor)
-
-
-class _SmoothedPlan(GravityPlan):
-    """Tables of a smoothing followed by a centre of gravity."""
-
-    @cached_property
-    def tables(self) -> gravity.GravityTables:
-        """See `GravityPlan`."""
-        from faintspot.slopes.estimators.spot_tables import gaussian_taps
-
-        std = np.repeat(self.each("smoothing_px")[:, None], 2, axis=1)
-        return gravity.GravityTables(taps=gaussian_taps(std, self.sensor.window))

@@ -1,5 +1,7 @@
 """Centre of gravity with a Gaussian weight; settings rows shared by estimators that know the spot."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
@@ -13,7 +15,7 @@ from faintspot.base.tables import PRESETS
 from faintspot.slopes.estimators import spot_tables
 from faintspot.slopes.estimators.base import Estimator, EstimatorPlan, Need, Style
 from faintspot.slopes.estimators.registry import register
-from faintspot.slopes.estimators.sensor import Scene, Sensor
+from faintspot.slopes.estimators.sensor import Scene
 from faintspot.slopes.estimators.spot_tables import SpotModel
 from faintspot.slopes.kernels import fits as spot_fits
 from faintspot.slopes.kernels.brightest import SMALLEST_VARIANCE
@@ -136,6 +138,21 @@ class SpotPlan(EstimatorPlan):
 _WIDTHS = (1.0, 0.6, 0.8, 1.25, 1.6, 2.2)  # multiples of the spot's width
 
 
+class _WeightedPlan(SpotPlan):
+    """Profiles of the weights."""
+
+    kernel = staticmethod(spot_fits.weighted_of_groups)
+
+    @cached_property
+    def model(self) -> SpotModel:
+        """Profiles of the weights."""
+        sensor = self.sensor
+        spot = sensor.spot_fwhm_px
+        factor = self.each("weight_fwhm_px") / np.sqrt(spot.prod(axis=1))
+        weight = spot * np.where(np.isnan(factor), 1.0, factor)[:, None]
+        return spot_tables.model_of_weights(weight, spot, sensor.psf, sensor.window, sensor.width)
+
+
 @register
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Weighted(Stepping):
@@ -162,27 +179,9 @@ class Weighted(Stepping):
     needs = frozenset({Need.WIDTH})
     cost = 0.23
     style = Style("#009E73", "--", "^")
+    plan = _WeightedPlan
     usual_steps: ClassVar[Mapping[str, int]] = {"accurate": 8, "fast": 3}
 
     def tuned(self, scene: Scene) -> Mapping[str, Sequence[Any]]:
         """Return widths around that of the spot."""
         return {"weight_fwhm_px": [factor * scene.seen_fwhm_px for factor in _WIDTHS]}
-
-    def prepared(self, sensor: Sensor) -> SpotPlan:
-        """See `Estimator`."""
-        return _WeightedPlan(self, sensor)
-
-
-class _WeightedPlan(SpotPlan):
-    """Profiles of the weights."""
-
-    kernel = staticmethod(spot_fits.weighted_of_groups)
-
-    @cached_property
-    def model(self) -> SpotModel:
-        """Profiles of the weights."""
-        sensor = self.sensor
-        spot = sensor.spot_fwhm_px
-        factor = self.each("weight_fwhm_px") / np.sqrt(spot.prod(axis=1))
-        weight = spot * np.where(np.isnan(factor), 1.0, factor)[:, None]
-        return spot_tables.model_of_weights(weight, spot, sensor.psf, sensor.window, sensor.width)

@@ -33,88 +33,6 @@ _LEAST_FLUX = 1e-6  # relative to the brightest spot
 MEAN, FRAME, NONE = "mean", "frame", "none"
 
 
-@register
-@dataclass(frozen=True, eq=False, kw_only=True)
-class Window(Estimator):
-    """Centre of gravity with a fixed window, divided by its mean flux and its gain (Nicolle et al. 2004)."""
-
-    window_fwhm_px: Value = option(
-        None,
-        "Full width at half maximum of the Gaussian window at the reference position, geometric mean of "
-        "both axes; the window has the elongation of the spot. Default: the width of the spot. Replaced by"
-        " the fixed weights of the pipeline, if given.",
-        unit="px",
-        low=0.1,
-        high=1e3,
-    )
-    region_px: Value = option(
-        None,
-        "Side of the square of pixels around the reference position that is used; bad or saturated pixels "
-        "elsewhere have no effect. Default: the whole sub-aperture.",
-        unit="px",
-        low=0.0,
-        high=64.0,
-        low_open=True,
-    )
-    normalisation: Value = option(
-        None,
-        'Normalisation of the sums. "mean": expected flux (`flux_e`, or a running mean); "frame": flux of '
-        'the frame within the window; "none": no normalisation. Default: "mean" if the flux is known, '
-        'otherwise "frame".',
-        choices=(MEAN, FRAME, NONE),
-        per_subaperture=False,
-    )
-    centroid_gain: Value = option(
-        None,
-        "Centroid gain: slope measured for a displacement of 1 px; slopes are divided by it. Default: that"
-        " of the spot near the reference position.",
-        low=0.0,
-        high=100.0,
-        low_open=True,
-    )
-
-    name = "window"
-    label = "fixed window"
-    method = "centre of gravity with a fixed window, divided by its mean flux and gain"
-    needs = frozenset({Need.WIDTH})
-    cost = 0.08
-    style = Style("#8C510A", "-", "p")
-
-    @property
-    def uses_flux(self) -> bool:
-        """See `Estimator`."""
-        return self.normalisation in (None, MEAN)
-
-    def tuned(self, scene: Scene) -> Mapping[str, Sequence[Any]]:
-        """Return widths around that of the spot; wider ones for speckled spots."""
-        factors = _WIDTHS_OF_SPECKLES if scene.d_over_r0 > 1 else _WIDTHS
-        return {"window_fwhm_px": [factor * scene.seen_fwhm_px for factor in factors]}
-
-    def for_bright_flux(self) -> Window:
-        """Normalise by the flux of the frame."""
-        return self.replaced({"normalisation": FRAME}) if self.uses_flux else self
-
-    def check(self, sensor: Sensor) -> None:
-        """See `Estimator`."""
-        weights = sensor.score
-        if isinstance(weights, FixedWeights):
-            if weights.window != sensor.window:
-                wanted, got = (f"{ny} x {nx}" for ny, nx in (sensor.window, weights.window))
-                raise InputError(f"weights: expected windows of {wanted} px as in the layout, got {got}")
-            weights.index_of(sensor.n)
-        else:
-            super().check(sensor)
-        if self.normalisation == MEAN and np.isnan(sensor.flux_e).any():
-            raise InputError(
-                f"settings.flux_e: expected the flux of the spots (electrons) for estimator {self.name!r} "
-                'with normalisation "mean", got none'
-            )
-
-    def prepared(self, sensor: Sensor) -> EstimatorPlan:
-        """See `Estimator`."""
-        return _WindowPlan(self, sensor)
-
-
 class _WindowPlan(EstimatorPlan):
     """Weights of each sub-aperture and the tables derived from them."""
 
@@ -277,6 +195,85 @@ class _WindowPlan(EstimatorPlan):
             illuminated = np.where(flux_e > _LEAST_FLUX * np.nan_to_num(flux_e).max(), flux_e, -1.0)
             table[window.DIVISOR] = np.where(np.isnan(flux_e), 0.0, illuminated)
         table[window.OFFSET_X], table[window.OFFSET_Y] = offsets
+
+
+@register
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Window(Estimator):
+    """Centre of gravity with a fixed window, divided by its mean flux and its gain (Nicolle et al. 2004)."""
+
+    window_fwhm_px: Value = option(
+        None,
+        "Full width at half maximum of the Gaussian window at the reference position, geometric mean of "
+        "both axes; the window has the elongation of the spot. Default: the width of the spot. Replaced by"
+        " the fixed weights of the pipeline, if given.",
+        unit="px",
+        low=0.1,
+        high=1e3,
+    )
+    region_px: Value = option(
+        None,
+        "Side of the square of pixels around the reference position that is used; bad or saturated pixels "
+        "elsewhere have no effect. Default: the whole sub-aperture.",
+        unit="px",
+        low=0.0,
+        high=64.0,
+        low_open=True,
+    )
+    normalisation: Value = option(
+        None,
+        'Normalisation of the sums. "mean": expected flux (`flux_e`, or a running mean); "frame": flux of '
+        'the frame within the window; "none": no normalisation. Default: "mean" if the flux is known, '
+        'otherwise "frame".',
+        choices=(MEAN, FRAME, NONE),
+        per_subaperture=False,
+    )
+    centroid_gain: Value = option(
+        None,
+        "Centroid gain: slope measured for a displacement of 1 px; slopes are divided by it. Default: that"
+        " of the spot near the reference position.",
+        low=0.0,
+        high=100.0,
+        low_open=True,
+    )
+
+    name = "window"
+    label = "fixed window"
+    method = "centre of gravity with a fixed window, divided by its mean flux and gain"
+    needs = frozenset({Need.WIDTH})
+    cost = 0.08
+    style = Style("#8C510A", "-", "p")
+    plan = _WindowPlan
+
+    @property
+    def uses_flux(self) -> bool:
+        """See `Estimator`."""
+        return self.normalisation in (None, MEAN)
+
+    def tuned(self, scene: Scene) -> Mapping[str, Sequence[Any]]:
+        """Return widths around that of the spot; wider ones for speckled spots."""
+        factors = _WIDTHS_OF_SPECKLES if scene.d_over_r0 > 1 else _WIDTHS
+        return {"window_fwhm_px": [factor * scene.seen_fwhm_px for factor in factors]}
+
+    def for_bright_flux(self) -> Window:
+        """Normalise by the flux of the frame."""
+        return self.replaced({"normalisation": FRAME}) if self.uses_flux else self
+
+    def check(self, sensor: Sensor) -> None:
+        """See `Estimator`."""
+        weights = sensor.score
+        if isinstance(weights, FixedWeights):
+            if weights.window != sensor.window:
+                wanted, got = (f"{ny} x {nx}" for ny, nx in (sensor.window, weights.window))
+                raise InputError(f"weights: expected windows of {wanted} px as in the layout, got {got}")
+            weights.index_of(sensor.n)
+        else:
+            super().check(sensor)
+        if self.normalisation == MEAN and np.isnan(sensor.flux_e).any():
+            raise InputError(
+                f"settings.flux_e: expected the flux of the spots (electrons) for estimator {self.name!r} "
+                'with normalisation "mean", got none'
+            )
 
 
 def _offsets(middles: Floats, window_px: tuple[int, int]) -> tuple[Floats, Floats]:
