@@ -1,6 +1,9 @@
 """Results of closed-loop experiments, small or made up, for tests of what is made of them."""
 
+from typing import Any
+
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 import faintspot as fs
 from faintspot.experiments.closed_loop.results import MagnitudeResult
@@ -30,16 +33,23 @@ def made_up_magnitude(gain_mag: float = 0.3, realisations: int = 6) -> Magnitude
             for shift in shifts
         ]
     )
-    shape = (len(LABELS), 5)
-    settings = np.full(shape, to_text(fs.Settings("brightest", keep_brightest=50)))
-    return MagnitudeResult(
-        NAMES,
-        LABELS,
-        100 * 10 ** (-0.4 * (magnitudes - 10)),
-        magnitudes,
-        strehl,
-        np.full(strehl.shape, 0.8),
-        settings,
-        np.full(shape, '{"loop_gain": 0.5}'),
-        LoopConfiguration().to_text(),
-    )
+    settings = np.full((len(LABELS), 5), to_text(fs.Settings("brightest", keep_brightest=50)))
+    configuration = LoopConfiguration().to_text()
+    photons = 100 * 10 ** (-0.4 * (magnitudes - 10))
+    return result_of(NAMES, photons, strehl, labels=LABELS, settings=settings, configuration=configuration)
+
+
+def result_of(
+    names: tuple[str, ...], photons: ArrayLike, strehl: NDArray[np.float64], **others: Any
+) -> MagnitudeResult:
+    """Strehl ratios (methods, fluxes, realisations); 100 photo-electrons are 10 magnitudes."""
+    shape, flux = strehl.shape[:2], np.asarray(photons, np.float64)
+    values = {
+        "labels": names,
+        "magnitudes": 10 - 2.5 * np.log10(flux / 100),
+        "centroid_gain": np.full(strehl.shape, 0.8),
+        "settings": np.full(shape, ""),
+        "choices": np.full(shape, '{"loop_gain": 0.5}'),
+        "configuration": "",
+    }
+    return MagnitudeResult(names=names, photons=flux, strehl=strehl, **{**values, **others})

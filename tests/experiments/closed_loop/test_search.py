@@ -1,12 +1,14 @@
 """The search for the best options."""
 
+from collections.abc import Callable
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 from tests.experiments.experiment_cases import SEARCH, small
+from tests.refusals import assert_each_refused
 
-from faintspot.base.errors import InputError
 from faintspot.experiments.closed_loop import search as tuning
 from faintspot.experiments.closed_loop.results import LOOP_GAIN, tuned_values
 from faintspot.experiments.closed_loop.search import (
@@ -30,68 +32,59 @@ def tuned(kind: Method, search: Search, *more: Any) -> Tuned:
     return stored(tune(kind, small(), search, *more))
 
 
-class _Record:
-    def __init__(self, strehl: float) -> None:
-        self._strehl = strehl
+@pytest.fixture
+def stands_in(monkeypatch: pytest.MonkeyPatch) -> Callable[[Callable[[float, int], float]], list[Any]]:
+    """Let the Strehl ratio be a function of loop gain and pixels kept; return what it is asked for."""
 
-    def mean_strehl(self) -> float:
-        return self._strehl
+    def stand_in(strehl: Callable[[float, int], float]) -> list[Any]:
+        asked: list[Any] = []
+
+        def simulate(configuration: Any, methods: Any, *, realisation: int) -> Any:
+            gain, kept = methods[0].gain, methods[0].settings.keep_brightest
+            asked.append((realisation, configuration.run.frames, gain, kept))
+            return SimpleNamespace(mean_strehl=lambda: strehl(gain, kept))
+
+        monkeypatch.setattr(tuning, "simulate_loop", simulate)
+        return asked
+
+    return stand_in
 
 
 @pytest.fixture
-def hill(monkeypatch: pytest.MonkeyPatch) -> list[int]:
-    """A loop whose Strehl ratio is highest at TOP and the best number of pixels; realisations used."""
-    used: list[int] = []
-
-    def simulate(configuration: Any, methods: Any, *, realisation: int) -> _Record:
-        used.append(realisation)
-        kept = methods[0].settings.keep_brightest
-        return _Record(1 - np.log(methods[0].gain / TOP) ** 2 - 0.1 * np.log(kept / BEST) ** 2)
-
-    monkeypatch.setattr(tuning, "simulate_loop", simulate)
-    return used
+def hill(stands_in: Any) -> list[Any]:
+    """A loop whose Strehl ratio is highest at TOP and the best number of pixels; what was simulated."""
+    return stands_in(lambda gain, kept: 1 - np.log(gain / TOP) ** 2 - 0.1 * np.log(kept / BEST) ** 2)  # type: ignore[no-any-return]
 
 
-def test_finds_the_top(hill: list[int]) -> None:
+def test_finds_the_top(hill: list[Any]) -> None:
     told: list[int] = []
     found = tuned(BRIGHTEST, Search(rounds=9), None, told.append)
     assert found.choice == {LOOP_GAIN: TOP, "keep_brightest": BEST}
     assert found.strehl == pytest.approx(1, abs=0.01)  # of the nearest values on offer
-    assert min(hill) >= FIRST_TUNING_REALISATION
+    assert min(hill)[0] >= FIRST_TUNING_REALISATION
     assert told == sorted(told)
 
 
-def test_climbs_the_second_hill_too(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_climbs_the_second_hill_too(stands_in: Any) -> None:
     low, middle, high = (GAINS.values.index(gain) for gain in GAINS.first)
     assert low > 0
     assert middle - low >= 3  # a top that no first choice is at
     heights = np.zeros(len(GAINS.values))
     heights[low - 1 : low + 2] = 0.6, 0.45, 0.3
     heights[middle], heights[high] = 0.4, 0.5
-
-    def simulate(configuration: Any, methods: Any, *, realisation: int) -> _Record:
-        kept = methods[0].settings.keep_brightest
-        return _Record(heights[GAINS.values.index(methods[0].gain)] - (kept != KEPT.first[0]))
-
-    monkeypatch.setattr(tuning, "simulate_loop", simulate)
+    stands_in(lambda gain, kept: heights[GAINS.values.index(gain)] - (kept != KEPT.first[0]))
     for climbs, top in ((1, high), (2, low - 1)):  # the first is the best of the coarse ones
         found = tuned(BRIGHTEST, Search(climbs=climbs)).choice[LOOP_GAIN]
         assert GAINS.nearest(found).values == (GAINS.values[top],)
 
 
-def test_looks_at_no_choice_twice(monkeypatch: pytest.MonkeyPatch) -> None:
-    looks = []
-
-    def simulate(configuration: Any, methods: Any, *, realisation: int) -> _Record:
-        looks.append((configuration.run.frames, methods[0].gain, methods[0].settings.keep_brightest))
-        return _Record(-abs(methods[0].gain - TOP))
-
-    monkeypatch.setattr(tuning, "simulate_loop", simulate)
+def test_looks_at_no_choice_twice(stands_in: Any) -> None:
+    looks = stands_in(lambda gain, kept: -abs(gain - TOP))
     tune(BRIGHTEST, small(), Search(rounds=9, realisations=1))
     assert len(looks) == len(set(looks))
 
 
-def test_without_rounds_the_best_coarse_choice(hill: list[int]) -> None:
+def test_without_rounds_the_best_coarse_choice(hill: list[Any]) -> None:
     found = tuned(BRIGHTEST, tuning.QUICK)
     nearest = min(KEPT.first, key=lambda kept: abs(np.log(kept / BEST)))
     assert found.choice == {LOOP_GAIN: GAINS.first[-1], "keep_brightest": nearest}
@@ -106,13 +99,10 @@ def test_is_repeatable_and_stored() -> None:
 
 
 def test_search_is_checked() -> None:
-    with pytest.raises(InputError, match=r"search.frames"):
-        Search(frames=50, settle_frames=60)
-    with pytest.raises(InputError, match=r"search.rounds"):
-        Search(rounds=-1)
+    assert_each_refused(Search, coarse_frames=[60], frames=[60, 100.5], rounds=[-1], climbs=[0])
 
 
-def test_control_that_learns_takes_the_slopes_that_were_tuned(hill: list[int]) -> None:
+def test_control_that_learns_takes_the_slopes_that_were_tuned(hill: list[Any]) -> None:
     kind = Method.named("brightest+kalman")
     found = tuned(kind, Search(rounds=9), {LOOP_GAIN: 0.9, "keep_brightest": BEST + 1})
     highest = max(tuned_values(kind, small())[LOOP_GAIN].values)
@@ -120,7 +110,7 @@ def test_control_that_learns_takes_the_slopes_that_were_tuned(hill: list[int]) -
     assert not hill  # nothing is left to tune
 
 
-def test_of_known_slopes_only_the_gain_is_tuned(hill: list[int]) -> None:
+def test_of_known_slopes_only_the_gain_is_tuned(hill: list[Any]) -> None:
     slopes = {LOOP_GAIN: GAINS.values[-3], "keep_brightest": BEST + 1}
     assert tuned(BRIGHTEST, Search(), slopes).choice == {**slopes, LOOP_GAIN: TOP}
 

@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tests.experiments.result_cases import result_of
 
 from faintspot.base.report.page import Table
 from faintspot.experiments.closed_loop.results import MagnitudeResult
@@ -20,10 +21,7 @@ def result(*means: tuple[float, float]) -> MagnitudeResult:
     """Strehl ratios of `METHODS` at both fluxes, which differ only by 0.001 between realisations."""
     own = 0.001 * np.array([[1, -1, 1, -1], [1, 1, -1, -1], [-1, 1, 1, -1], [1, -1, -1, 1], [-1, -1, 1, 1]])
     strehl = np.array(means)[:, :, None] + SCATTER + own[:, None]
-    texts = np.full((5, 2), "{}")
-    return MagnitudeResult(
-        METHODS, METHODS, FLUXES, -2.5 * np.log10(FLUXES), strehl, strehl, texts, texts, ""
-    )
+    return result_of(METHODS, FLUXES, strehl)
 
 
 def test_a_winner_is_above_all_others_and_the_gain_of_tv_is_paired() -> None:

@@ -14,8 +14,7 @@ from faintspot.base.checks import finite_array
 from faintspot.base.errors import InputError
 from faintspot.base.files import NpzFile
 from faintspot.base.options import Option
-from faintspot.base.report.texts import with_error
-from faintspot.base.statistics import DRAWS, FEWEST_PIECES, SEED, Estimate, of_draws, paired_mean
+from faintspot.base.statistics import DRAWS, FEWEST_PIECES, SEED, UNKNOWN, Estimate, of_draws, paired_mean
 from faintspot.experiments.methods import Choice, crossings
 from faintspot.loop.control.base import INTEGRATOR, KALMAN
 from faintspot.loop.simulation import methods
@@ -31,47 +30,18 @@ from faintspot.slopes.spots.psf import PSF, spot_psf
 Floats = NDArray[np.float64]
 
 
-@dataclass(frozen=True)
-class Limit:
-    """Magnitude at which a Strehl curve falls below a level, or the distance of two curves there."""
-
-    magnitude: Estimate
-    """Infinite: above the level with every star that was measured; minus infinite: below it."""
-    interpolation_error: float
-    """Error of interpolation between measured stars: the difference from straight lines."""
-
-    @property
-    def is_known(self) -> bool:
-        """Whether it is within what was measured."""
-        return math.isfinite(self.magnitude.value)
-
-    @property
-    def error(self) -> float:
-        """Standard error, both kinds together; NaN with too few realisations."""
-        return math.hypot(self.magnitude.standard_error, self.interpolation_error)
-
-    @property
-    def estimate(self) -> Estimate:
-        """Value and interval with both kinds of error."""
-        return self.magnitude.widened(self.interpolation_error)
-
-    def in_words(self, *, sign: bool = False) -> str:
-        """Return it with its error, at least 0.01 mag."""
-        return with_error(Estimate(self.magnitude.value, self.error), 2, sign=sign, smallest=0.01)
-
-
-def magnitude_limit(magnitudes: ArrayLike, strehl: ArrayLike, level: float) -> Limit:
+def magnitude_limit(magnitudes: ArrayLike, strehl: ArrayLike, level: float) -> Estimate:
     """Return the limiting magnitude at a Strehl ratio; parameters are those of `magnitude_gain`."""
     return _limit(*_complete(magnitudes, strehl), level)
 
 
-def magnitude_gain(magnitudes: ArrayLike, strehl: ArrayLike, reference: ArrayLike, level: float) -> Limit:
+def magnitude_gain(magnitudes: ArrayLike, strehl: ArrayLike, reference: ArrayLike, level: float) -> Estimate:
     """Return the gain in limiting magnitude at a Strehl ratio, with its interval over realisations.
 
     Each method's mean curve is made to fall with magnitude (isotonic regression) and interpolated by a
     monotone cubic between its points, never beyond them. Realisations are drawn with replacement, the same
-    ones for both methods. Curves that bend alike are wrong alike: the error of interpolation is the change
-    that it makes to the gain.
+    ones for both methods. Curves that bend alike are wrong alike: the error of interpolation, which widens
+    the interval, is the change that straight lines make to the gain.
 
     Parameters
     ----------
@@ -83,7 +53,7 @@ def magnitude_gain(magnitudes: ArrayLike, strehl: ArrayLike, reference: ArrayLik
 
     Returns
     -------
-    Limit
+    Estimate
         Infinite where the method's curve stays above the level and the reference's does not, minus infinite
         where it stays below; NaN where neither crosses it, or nothing is measured yet. An end of the interval
         is infinite where more than 2.5 % of the draws left the measured magnitudes there.
@@ -109,10 +79,10 @@ def _complete(magnitudes: ArrayLike, *strehl: ArrayLike) -> tuple[Floats, list[F
     return faint[order], [curve[order] for curve in curves]
 
 
-def _limit(faint: Floats, curves: list[Floats], level: float) -> Limit:
+def _limit(faint: Floats, curves: list[Floats], level: float) -> Estimate:
     """Return the limit of one curve, or the difference of those of two."""
     if len(faint) < 2:
-        return Limit(Estimate(math.nan), 0.0)
+        return UNKNOWN
 
     def read_off(*, straight: bool) -> float:
         found = (crossings(faint, falling(curve.mean(axis=1)), level, straight=straight) for curve in curves)
@@ -120,17 +90,15 @@ def _limit(faint: Floats, curves: list[Floats], level: float) -> Limit:
         return first - sum(others)
 
     value, realisations = read_off(straight=False), curves[0].shape[1]
-    if not math.isfinite(value):
-        return Limit(Estimate(value), 0.0)
+    if not math.isfinite(value) or realisations < FEWEST_PIECES:
+        return Estimate(value)
     between = abs(read_off(straight=True) - value)
     if len(faint) == 2:  # no bend is seen: each curve may cross anywhere between the two
         between = math.sqrt(len(curves) / 12) * float(faint[1] - faint[0])
-    if realisations < FEWEST_PIECES:
-        return Limit(Estimate(value), between)
     draws = np.random.default_rng(SEED).integers(0, realisations, (DRAWS, realisations))
     ends = [crossings(faint, falling(curve[:, draws].mean(axis=2).T), level) for curve in curves]
     drawn = ends[0] if len(ends) == 1 else _differences(*ends)
-    return Limit(of_draws(value, drawn, realisations), between)
+    return of_draws(value, drawn, realisations).widened(between)
 
 
 def falling(values: ArrayLike) -> Floats:
@@ -203,9 +171,7 @@ def gains_in_magnitude(result: MagnitudeResult, method: int, reference: int) -> 
     curve = np.array([paired_mean(values).value for values in result.strehl[reference]])
     finite = curve[np.isfinite(curve)]
     return {
-        level: magnitude_gain(
-            result.magnitudes, result.strehl[method], result.strehl[reference], level
-        ).estimate
+        level: magnitude_gain(result.magnitudes, result.strehl[method], result.strehl[reference], level)
         for level in _STREHL_LEVELS
         if len(finite) and finite.min() < level <= finite.max()
     }
@@ -213,13 +179,6 @@ def gains_in_magnitude(result: MagnitudeResult, method: int, reference: int) -> 
 
 LOOP_GAIN = "loop_gain"
 NOISE_SCALE = "noise_scale"
-_NOISE_SCALES = (0.35, 0.6, 1.0)
-_FIRST_NOISE_SCALES = (0.6,)
-_LOOP_GAINS = (0.05, 0.07, 0.1, 0.13, 0.17, 0.22, 0.28, 0.35, 0.43, 0.52, 0.62, 0.73, 0.85)
-_FIRST_LOOP_GAINS = (0.17, 0.35, 0.62)
-# Of control that learns it is only the gain at which telemetry is taken, which takes long.
-_TELEMETRY_GAINS = (0.05, 0.1, 0.2, 0.3, 0.4)
-_FIRST_TELEMETRY_GAINS = (0.2,)
 # How far spots are from where a prior expects them is the loop's to say: parts of their range.
 _PRIORS = (0.1, 0.175, 0.25, 0.35, 0.5, 0.75)
 _METHODS_OF_LASER = (
@@ -245,6 +204,14 @@ class Tunable:
         return Tunable((near,), (near,))
 
 
+_NOISE_SCALES = Tunable((0.35, 0.6, 1.0), (0.6,))
+_LOOP_GAINS = Tunable(
+    (0.05, 0.07, 0.1, 0.13, 0.17, 0.22, 0.28, 0.35, 0.43, 0.52, 0.62, 0.73, 0.85), (0.17, 0.35, 0.62)
+)
+# Of control that learns it is only the gain at which telemetry is taken, which takes long.
+_TELEMETRY_GAINS = Tunable((0.05, 0.1, 0.2, 0.3, 0.4), (0.2,))
+
+
 def tuned_values(method: methods.Method, configuration: LoopConfiguration) -> dict[str, Tunable]:
     """Return what is tuned for a configuration's flux: the loop gain and options of the estimator."""
     estimator = method.estimator.for_scene(configuration.scene)
@@ -259,11 +226,9 @@ def tuned_values(method: methods.Method, configuration: LoopConfiguration) -> di
         options.pop(methods.PRIOR, None)  # the filter knows it
     if methods.FILTER in method.variants:
         options = {}  # the spots determine it
-    tuned = {LOOP_GAIN: Tunable(_LOOP_GAINS, _FIRST_LOOP_GAINS)}
-    if method.control != INTEGRATOR:
-        tuned[LOOP_GAIN] = Tunable(_TELEMETRY_GAINS, _FIRST_TELEMETRY_GAINS)
+    tuned = {LOOP_GAIN: _LOOP_GAINS if method.control == INTEGRATOR else _TELEMETRY_GAINS}
     if method.control == KALMAN and estimator.takes_prior:
-        tuned[NOISE_SCALE] = Tunable(_NOISE_SCALES, _FIRST_NOISE_SCALES)
+        tuned[NOISE_SCALE] = _NOISE_SCALES
     for number, (name, values) in enumerate(options.items()):
         tuned[name] = _spread(values, _FIRST_VALUES[min(number, len(_FIRST_VALUES) - 1)])
     return tuned
@@ -334,11 +299,11 @@ def _wider(values: Sequence[Any], option: Option) -> Sequence[Any]:
 
 def _spread(values: Sequence[Any], count: int) -> Tunable:
     """Return values in their order, and some of them, evenly spread, for a first look."""
-    ordered = sorted(set(values))
+    ordered = tuple(sorted(set(values)))
     if len(ordered) <= count:
-        return Tunable(tuple(ordered), tuple(ordered))
+        return Tunable(ordered, ordered)
     middles = (2 * np.arange(count) + 1) / (2 * count) * (len(ordered) - 1)
-    return Tunable(tuple(ordered), tuple(ordered[int(position + 0.5)] for position in middles))
+    return Tunable(ordered, tuple(ordered[int(position + 0.5)] for position in middles))
 
 
 def _flat_psf(configuration: LoopConfiguration) -> PSF:

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from faintspot.base.report import page
 from faintspot.base.report.plots import Line, Panel
-from faintspot.base.report.texts import Texts, plain_number, with_error, with_interval
+from faintspot.base.report.texts import Texts, plain_number, with_error
 from faintspot.base.statistics import Estimate, paired_mean
 from faintspot.base.text_files import parse_json
 from faintspot.experiments.closed_loop.results import (
@@ -75,17 +75,19 @@ def _settings_words(choice: str, text: str) -> str:
 
 REFERENCES = Window.name, BrightestPixels.name
 """Baselines of every gain, first and second, both with the integrator."""
-NOWHERE = "TV raises the Strehl ratio nowhere beyond its error"
 
 
 def loop_verdict(result: MagnitudeResult) -> list[str]:
     """Return what the results say about TV, and then about the other ways to measure slopes."""
-    lines = [*_recommendations(result), *_comparisons(result)]
+    reference, *_ = reference_methods(result)
+    methods = (method for method in range(len(result.labels)) if method != reference)
+    compared = (_comparison(result, method, reference) for method in methods)
+    lines = [*_recommendations(result), *compared]
     # What the denoising itself does: against the same without it.
-    tv, reference = tv_method(result), reference_methods(result)[-1]
-    if tv is None or tv == reference:
+    tv, without = tv_method(result), reference_methods(result)[-1]
+    if tv is None or tv == without:
         return lines
-    return [_headline(differences_by_flux(result, tv, reference)), *lines]
+    return [_headline(differences_by_flux(result, tv, without)), *lines]
 
 
 def equal_methods(result: MagnitudeResult, flux: int) -> list[int]:
@@ -115,16 +117,15 @@ def _recommendations(result: MagnitudeResult) -> list[str]:
     for flux in reversed(range(len(result.photons))):
         if not (equal := equal_methods(result, flux)):
             continue
-        best, *same = equal
-        recommended.append(best)
-        choice = parse_json(str(result.choices[best, flux]))
+        label, *others = (result.labels[method] for method in equal)
+        recommended.append(equal[0])
         values = ", ".join(
             f"{name} {value if isinstance(value, str) else plain_number(value)}"
-            for name, value in choice.items()
+            for name, value in parse_json(str(result.choices[equal[0], flux])).items()
         )
-        as_good = f"; as good: {', '.join(result.labels[method] for method in same)}" if same else ""
-        star = f"{result.magnitudes[flux]:.2f} ({plain_number(result.photons[flux])} e-)"
-        lines.append(f"Recommended at magnitude {star}: {result.labels[best]} ({values}){as_good}.")
+        star = {"magnitude": result.magnitudes[flux], "photons": plain_number(result.photons[flux])}
+        as_good = ", ".join(others) or None
+        lines.append(_sentence("recommended", label=label, values=values, others=as_good, **star))
     means = result.strehl.mean(axis=2)
     if np.isfinite(means).any() and len(result.photons) > 1:
         level = 0.5 * float(np.nanmax(means))
@@ -132,7 +133,11 @@ def _recommendations(result: MagnitudeResult) -> list[str]:
             result.labels[method]: magnitude_limit(result.magnitudes, result.strehl[method], level)
             for method in dict.fromkeys([*recommended, *reference_methods(result)])
         }
-        known = [f"{label} {limit.in_words()}" for label, limit in limits.items() if limit.is_known]
+        known = [
+            f"{label} {with_error(limit, 2, smallest=0.01)}"
+            for label, limit in limits.items()
+            if np.isfinite(limit.value)
+        ]
         lines += [f"Limiting magnitudes at Strehl {level:.2f}: {', '.join(known)}."] if known else []
     return lines
 
@@ -148,30 +153,20 @@ def tv_method(result: MagnitudeResult) -> int | None:
 
 
 def _headline(comparisons: list[Estimate]) -> str:
-    finite = [comparison for comparison in comparisons if np.isfinite(comparison.low)]
-    if not finite:
-        return "Too few measurements to say whether TV raises the Strehl ratio."
-    gains, losses = (sum(comparison.decided == sign for comparison in finite) for sign in (1, -1))
-    if gains:
-        first = f"TV raises the Strehl ratio beyond its error in {gains} of {len(finite)} comparisons"
-    else:
-        first = NOWHERE
-    return (
-        f"{first}; it lowers it beyond its error in {losses} of {len(finite)} comparisons."
-        if losses
-        else f"{first}."
+    decided = [comparison.decided for comparison in comparisons if np.isfinite(comparison.low)]
+    gains, losses = decided.count(1), decided.count(-1)
+    return _sentence(
+        "headline",
+        measured=bool(decided),
+        measured_fluxes=len(decided),
+        gains=gains or None,
+        nowhere=not gains,
+        losses=losses or None,
     )
 
 
-def _comparisons(result: MagnitudeResult) -> list[str]:
-    """Return each method's differences from the strongest baseline."""
-    reference = reference_methods(result)[0]
-    return [
-        _comparison(result, method, reference) for method in range(len(result.labels)) if method != reference
-    ]
-
-
 def _comparison(result: MagnitudeResult, method: int, reference: int) -> str:
+    """Return a method's differences from the strongest baseline, and its gain in the middle of levels."""
     decided = [difference.decided for difference in differences_by_flux(result, method, reference)]
 
     def fluxes(outcome: int) -> str:
@@ -180,26 +175,26 @@ def _comparison(result: MagnitudeResult, method: int, reference: int) -> str:
         pairs = zip(result.photons, decided, strict=True)
         return ", ".join(f"{flux:.3g} e-" for flux, sign in pairs if sign == outcome)
 
-    parts = [
+    changes = [
         f"{word} Strehl beyond its error at {where}"
         for word, where in (("more", fluxes(1)), ("less", fluxes(-1)))
         if where
     ]
-    verdict = "; ".join(parts) if parts else "no difference beyond its error at any flux"
-    gain = _gain_in_magnitude(result, method, reference)
-    return f"Magnitudes, {result.labels[method]} against {result.labels[reference]}: {verdict}{gain}."
+    levels = gains_in_magnitude(result, method, reference).items()
+    gains = [(level, gain) for level, gain in levels if np.isfinite(gain.value) and not np.isnan(gain.low)]
+    level, gain = gains[len(gains) // 2] if gains else (None, None)
+    return _sentence(
+        "compared",
+        label=result.labels[method],
+        reference=result.labels[reference],
+        changes="; ".join(changes) or "no difference beyond its error at any flux",
+        level=level,
+        gain=gain,
+    )
 
 
-def _gain_in_magnitude(result: MagnitudeResult, method: int, reference: int) -> str:
-    """Return the gain at the middle one of the Strehl ratios at which there is one."""
-    levels = gains_in_magnitude(result, method, reference)
-    gains = [
-        (level, gain) for level, gain in levels.items() if np.isfinite(gain.value) and not np.isnan(gain.low)
-    ]
-    if not gains:
-        return ""
-    level, middle = gains[len(gains) // 2]
-    return f"; limiting magnitude at Strehl {level:g}: {with_interval(middle, 2)} mag"
+def _sentence(name: str, **values: object) -> str:
+    return f"{_TEXT(f'verdict.lines.{name}', **values)}."
 
 
 _WIDTH = 100

@@ -1,7 +1,7 @@
 """Map of closed-loop gains by denoising: methods over flux, read noise and turbulence."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -61,8 +61,6 @@ def run_loop_map(
     folder: str | Path,
     *,
     quick: bool = False,
-    cameras: Mapping[str, Mapping[str, Any]] = CAMERAS,
-    search: Search | None = None,
     pool: WorkerPool | None = None,
     overwrite: bool = False,
 ) -> list[LoopCell]:
@@ -76,9 +74,6 @@ def run_loop_map(
     folder : path
     quick : bool
         Fewer fluxes and realisations, a coarse search: a third of the time.
-    cameras : mapping
-        Options of the camera by its name.
-    search : Search, optional
     pool : WorkerPool, optional
         Default: processes on this machine.
     overwrite : bool
@@ -92,13 +87,12 @@ def run_loop_map(
         When HCIPy is not installed.
     """
     folder = make_folder(folder)
-    columns = [(r0, camera) for r0 in R0_M for camera in cameras]
+    columns = [(r0, camera) for r0 in R0_M for camera in CAMERAS]
     pools = in_stages(pool or WorkerPool(), [1000] * len(columns))
-    fluxes = _QUICK_FLUXES_E if quick else FLUXES_E
-    search = search or (QUICK if quick else _SEARCH)
+    fluxes, search = (_QUICK_FLUXES_E, QUICK) if quick else (FLUXES_E, _SEARCH)
     cells = []
     for (r0, camera), part in zip(columns, pools, strict=True):
-        loop = _loop(r0, cameras[camera], quick)
+        loop = _loop(r0, CAMERAS[camera], quick)
         place = folder / f"r0-{100 * r0:g}cm-{camera.replace(' ', '')}"
         result = run_magnitude(loop, place, METHODS, fluxes, search=search, pool=part, overwrite=overwrite)
         cells += cells_of(result, r0, camera)
@@ -175,6 +169,6 @@ def _figure(cells: list[LoopCell]) -> FigureWithData:
             words[column, row] = f"{cell.gain.value:+.3f}\n{cell.winner or NOTHING}"
         unit = "Strehl ratio with TV minus without" if r0 == R0_M[-1] else ""
         marks = [Labels(list(words), list(words.values()), _IN_CELL)]
-        picture = Picture(gains, unit, f"r0 {100 * r0:g} cm", *axes, style, marks)
-        pictures.append(replace(picture, x_names=[f"{flux:g}" for flux in fluxes], y_names=cameras))
+        names: dict[str, Any] = {"x_names": [f"{flux:g}" for flux in fluxes], "y_names": cameras}
+        pictures.append(Picture(gains, unit, f"r0 {100 * r0:g} cm", *axes, style, marks, **names))
     return _TEXT.figure("loop_map", [pictures], 4.6)
