@@ -95,7 +95,8 @@ def test_the_limit_is_sought_beyond_the_plot() -> None:
     assert answer.flux_e[answer.at_star] == pytest.approx(200.0)
     assert "all that was tried" not in " ".join(answer_text.recommendation(answer))
     # R of the recommended method at its limit is the budget: straight line in log-log between the points.
-    found = np.exp(np.interp(np.log(limit.value), np.log(answer.flux_e), np.log(answer.best.error_px)))
+    error = answer.curve.of(answer.best.method.name)
+    found = np.exp(np.interp(np.log(limit.value), np.log(answer.flux_e), np.log(error)))
     assert found == pytest.approx(0.02, rel=0.05)
 
 

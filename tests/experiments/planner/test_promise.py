@@ -43,7 +43,7 @@ def test_without_darks_the_flux_is_right_and_the_promise_kept(tmp_path: Path) ->
     answer = answered(0.7, 0.5)
     question, promise = answer.question, answer.promise
     assert question.star_flux_e == pytest.approx(300.0, rel=0.06)  # as the gain
-    assert any("fitting spots and background" in fact for fact in question.facts)
+    assert any("fitting spots and background" in fact for fact in question.recorded.facts)
     # 99 % of normal movement of 0.7 px about places within 0.5 px lie within 1.9 px; then the margin.
     assert question.spots.search_range_px == pytest.approx(1.15 * 1.9, rel=0.15)
     assert promise is not None

@@ -34,7 +34,7 @@ def test_camera_flux_and_spot_are_measured() -> None:
     assert question.read_noise_e == pytest.approx(4.0, rel=0.06)  # as the gain
     assert question.star_flux_e == pytest.approx(3000.0, rel=0.06)  # spots off the middle lose a little
     assert question.spots.fwhm_px == pytest.approx(1.77, rel=0.1)
-    assert any("PSF learnt" in fact for fact in question.facts)
+    assert any("PSF learnt" in fact for fact in question.recorded.facts)
 
 
 @pytest.mark.slow
@@ -102,7 +102,7 @@ def test_a_faint_recording_has_the_range_of_its_spots() -> None:
     assert question.star_flux_e == pytest.approx(30.0, rel=0.15)
     dark = question_from_frames(camera.expose(np.zeros(frames.shape), rng), **known, flux_e=30.0)
     assert dark.search_range_px == 1.0
-    assert any("the flux is too low" in fact for fact in dark.facts)
+    assert any("the flux is too low" in fact for fact in dark.recorded.facts)
 
 
 def test_a_single_frame_is_not_checked() -> None:
@@ -154,7 +154,7 @@ def test_dark_subapertures_are_left_out_of_the_question_but_not_of_the_layout() 
     lit = np.arange(36) != 7
     frames, _ = sensor_frames(LAYOUT, 12, flux_e=1000.0 * lit, detector=CAMERA, rng=np.random.default_rng(7))
     question = question_from_frames(frames, layout=LAYOUT, gain_e_per_adu=0.5)
-    assert "left out 1 of 36 sub-apertures: dark" in question.facts
+    assert "left out 1 of 36 sub-apertures: dark" in question.recorded.facts
     assert question.star_flux_e == pytest.approx(1000.0, rel=0.03)
     assert question.layout == LAYOUT[lit]
     assert question.whole_layout == LAYOUT

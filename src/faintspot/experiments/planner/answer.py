@@ -3,6 +3,7 @@
 import math
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -14,6 +15,7 @@ from faintspot.experiments.curves import Curve
 from faintspot.experiments.methods import Knowledge
 from faintspot.experiments.planner.promise import Promise
 from faintspot.experiments.planner.question import Question
+from faintspot.experiments.planner.stated import CAMERA
 from faintspot.loop.simulation.methods import Method
 from faintspot.slopes.camera.calibration import Calibration
 from faintspot.slopes.pipeline import configuration
@@ -29,10 +31,6 @@ class MethodResult:
 
     method: Method
     statistics: SlopeStatistics
-    error_px: Floats
-    """(m,) R at every flux, the settings chosen anew at each."""
-    standard_error_px: Floats
-    """(m,) of R."""
     over_brightest: Estimate
     """Magnitudes of guide star gained over brightest pixels, by R."""
     over_thresholded: Estimate
@@ -52,7 +50,7 @@ class Answer:
 
     question: Question
     curve: Curve
-    """R of all methods at m fluxes."""
+    """R of all methods at m fluxes, the settings chosen anew at each."""
     results: tuple[MethodResult, ...]
     equal: tuple[str, ...]
     """Names of the methods that are as good as the best within the errors; the first is recommended."""
@@ -123,14 +121,10 @@ class Answer:
         """The camera, with the maps that the question brought along."""
         question = self.question
         base = Calibration() if question.calibration is None else question.calibration
-        same_noise = base.typical_read_noise_e == question.read_noise_e
-        return replace(
-            base,
-            gain_e_per_adu=question.gain_e_per_adu,
-            em_gain=question.em_gain,
-            read_noise_e=base.read_noise_e if same_noise else question.read_noise_e,
-            background_e=question.background_e,
-        )
+        stated: dict[str, Any] = {name: getattr(question, name) for name in CAMERA}
+        if base.typical_read_noise_e == question.read_noise_e:
+            stated["read_noise_e"] = base.read_noise_e
+        return replace(base, **stated)
 
     def __getitem__(self, name: str) -> MethodResult:
         """Return the result of an estimator.

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.checks import not_none, spawn
-from faintspot.base.statistics import Estimate
+from faintspot.base.statistics import UNKNOWN, Estimate
 from faintspot.experiments.planner.question import Question
 from faintspot.loop.simulation.methods import Method
 from faintspot.slopes.camera.calibration import Calibration
@@ -234,7 +234,7 @@ def images_e(frames: NDArray[np.generic], layout: Layout, calibration: Calibrati
 def _recorded(question: Question) -> tuple[Floats, LearntPSF]:
     """Images (n_frames, n, ny, nx) of the recording in photo-electrons, and the spots fitted to them."""
     layout, calibration = not_none(question.layout), not_none(question.calibration)
-    images = images_e(not_none(question.recording)[: frames_to_check(layout)], layout, calibration)
+    images = images_e(not_none(question.recorded.frames)[: frames_to_check(layout)], layout, calibration)
     psf = question.spots.known_psf(max(question.spots.shape))
     camera = Calibration(read_noise_e=question.read_noise_photoelectrons, background_e=question.background_e)
     search = question.spots.search_range_px + float(np.abs(layout.offsets).max())
@@ -326,4 +326,4 @@ def _frame_to_frame(slopes: Floats) -> Estimate:
         for order in _ORDERS
         if order < len(slopes)
     ]
-    return min(estimates, key=lambda estimate: estimate.value, default=Estimate(math.nan))
+    return min(estimates, key=lambda estimate: estimate.value, default=UNKNOWN)

@@ -30,6 +30,7 @@ from faintspot.slopes.spots.psf import PSF
 LARGEST_FLUX_E = 1e9
 """Largest flux of a spot in a frame."""
 _SMALLEST_RANGE_PX = 1.0
+_STAR: dict[str, Any] = {"group": "star", **positive}
 _BUDGET = re.compile(r"\s*([-+0-9.eE]+)\s*(px|arcsec|mas)?\s*")
 
 
@@ -129,19 +130,11 @@ class Question(StarLight, StatedOptics, StatedCamera):
     psf: PSF | None = None
     laser: LaserSpots | None = None
     flux_e: Any = setting(
-        None,
-        "Flux instead: photo-electrons per sub-aperture and frame.",
-        unit="e-",
-        group="star",
-        **positive,
+        None, "Flux instead: photo-electrons per sub-aperture and frame.", unit="e-", **_STAR
     )
-    frame_rate_hz: Any = setting(None, "Frame rate.", unit="Hz", group="star", **positive)
+    frame_rate_hz: Any = setting(None, "Frame rate.", unit="Hz", **_STAR)
     search_range_px: Any = setting(
-        None,
-        "Largest slope. Default: from the frames, or FWHM / 2.",
-        unit="px",
-        group="tune",
-        **positive,
+        None, "Largest slope. Default: from the frames, or FWHM / 2.", unit="px", group="tune", **positive
     )
     budget: str | None = setting(
         None,
@@ -153,7 +146,7 @@ class Question(StarLight, StatedOptics, StatedCamera):
     )
     layout: Layout | None = None
     calibration: Calibration | None = None
-    recorded: Recorded | None = None
+    recorded: Recorded = Recorded()
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -184,8 +177,7 @@ class Question(StarLight, StatedOptics, StatedCamera):
         if (limit := min(shape) / 2) < reach:
             expected = f"expected at most half a window, {limit:g} px"
             raise InputError(expected, name="search_range_px", value=reach)
-        relative = None if self.recorded is None else self.recorded.relative_flux
-        return Spots(shape, fwhm_px, profile, psf, d_over_r0, float(reach), relative)
+        return Spots(shape, fwhm_px, profile, psf, d_over_r0, float(reach), self.recorded.relative_flux)
 
     def scene(self, flux_e: float) -> Scene:
         """Return the settings that estimators have for spots of this flux."""
@@ -221,17 +213,7 @@ class Question(StarLight, StatedOptics, StatedCamera):
     @property
     def subject(self) -> str:
         """The source of the flux, for messages: a star, or a recording that is measured."""
-        return "recording" if self.recorded is not None and self.recorded.flux_is_measured else "star"
-
-    @property
-    def recording(self) -> NDArray[Any] | None:
-        """Frames on which promised errors are checked, if any."""
-        return None if self.recorded is None else self.recorded.frames
-
-    @property
-    def facts(self) -> tuple[str, ...]:
-        """Sources of measured values."""
-        return () if self.recorded is None else self.recorded.facts
+        return "recording" if self.recorded.flux_is_measured else "star"
 
     @property
     def flux_is_known(self) -> bool:
@@ -241,7 +223,7 @@ class Question(StarLight, StatedOptics, StatedCamera):
     @property
     def whole_layout(self) -> Layout | None:
         """Layout to write."""
-        whole = None if self.recorded is None else self.recorded.whole_layout
+        whole = self.recorded.whole_layout
         return self.layout if whole is None else whole
 
     @property

@@ -20,6 +20,7 @@ from faintspot.experiments.planner.question import (
     check_not_quad_cells,
     default_search_range_px,
 )
+from faintspot.experiments.planner.stated import CAMERA
 from faintspot.slopes.camera.calibration import Calibration
 from faintspot.slopes.camera.frame_checks import are_repeated
 from faintspot.slopes.camera.photon_transfer import DetectorMeasurement, measure_detector
@@ -125,8 +126,7 @@ def question_from_frames(frames: ArrayLike, darks: ArrayLike | None = None, **st
             f"sub-aperture and frame, on average (pixels above the background add up to {sums:.0f})"
         )
     relative = _relative_flux(fitted, len(layout), facts)
-    camera = ("gain_e_per_adu", "em_gain", "read_noise_e", "background_e")
-    stated |= {name: getattr(calibration, name) for name in camera}
+    stated |= {name: getattr(calibration, name) for name in CAMERA}
     recorded = Recorded(recording, whole, relative, flux_is_measured, tuple(facts))
     return Question(**stated, layout=layout, calibration=calibration, recorded=recorded)
 
@@ -163,7 +163,8 @@ def _calibration(
 ) -> Calibration:
     """Dark, gain and read noise: measured, or given."""
     em_gain = float(stated.get("em_gain") or 1.0)
-    measured = _measured(stack, darks, layout, em_gain)
+    usable_darks = darks if darks is not None and len(darks) > 1 else None
+    measured = _measured(stack, usable_darks, layout, em_gain)
     gain, read_noise = stated.get("gain_e_per_adu"), stated.get("read_noise_e")
     dark: object = float(np.median(layout.images(stack)[..., [0, -1], :]))
     if darks is not None:
@@ -171,7 +172,7 @@ def _calibration(
     elif measured is not None:
         dark = measured.dark_level_adu.value
     read_noise_adu = pixel_noise(layout.images(stack)) if measured is None else measured.read_noise_adu.value
-    how = "from the darkest pixels of the frames" if darks is None or len(darks) < 2 else "from the darks"
+    how = "from the darkest pixels of the frames" if usable_darks is None else "from the darks"
     if gain is None:
         if measured is None or np.isnan(measured.gain_e_per_adu.value):
             raise InputError(
@@ -190,7 +191,7 @@ def _calibration(
         else:  # where it is possible, it is the better one: movement and faint flux do not bias it
             gain, error = about_spots.gain_e_per_adu, about_spots.gain_e_per_adu_error
             way = "about fitted spots, wherever they move"
-            if darks is None or len(darks) < 2:
+            if usable_darks is None:
                 read_noise_adu, how = about_spots.read_noise_adu, "in the pixels about the fitted spots"
         facts.append(f"gain measured {way}: {gain:.3g} +- {error:.2g} electrons per ADU")
     _check_flux(stack, dark, layout, gain / em_gain)
@@ -213,12 +214,11 @@ def _measured(
     stack: NDArray[np.generic], darks: NDArray[np.generic] | None, layout: Layout, em_gain: float
 ) -> DetectorMeasurement | None:
     """Camera properties measured in the frames; None where they are too few."""
-    usable_darks = None if darks is None or len(darks) < 2 else darks[: max(2, _DARK_PIXELS // darks[0].size)]
+    if darks is not None:
+        darks = darks[: max(2, _DARK_PIXELS // darks[0].size)]
     if len(stack) > 1:
-        return measure_detector(stack, usable_darks, layout=layout, em_gain=em_gain)
-    if usable_darks is not None:
-        return measure_detector(None, usable_darks, em_gain=em_gain)
-    return None
+        return measure_detector(stack, darks, layout=layout, em_gain=em_gain)
+    return None if darks is None else measure_detector(None, darks, em_gain=em_gain)
 
 
 def _measured_on_spots(stack: NDArray[Any], dark: Any, layout: Layout, em_gain: float) -> SpotTransfer | str:

@@ -29,6 +29,9 @@ SEEING_WAVELENGTH_NM = 500.0
 _ARCSEC = math.pi / 180 / 3600
 
 positive = {"low": 0.0, "low_open": True}
+_SPOT: dict[str, Any] = {"group": "spot", **positive}
+CAMERA = ("gain_e_per_adu", "em_gain", "read_noise_e", "background_e")
+"""Numbers of a camera, as of `Calibration`."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -52,12 +55,7 @@ class StatedCamera(Options):
     @property
     def camera(self) -> Calibration:
         """The camera without its maps."""
-        return Calibration(
-            gain_e_per_adu=self.gain_e_per_adu,
-            em_gain=self.em_gain,
-            read_noise_e=self.read_noise_e,
-            background_e=self.background_e,
-        )
+        return Calibration(**{name: getattr(self, name) for name in CAMERA})
 
     @property
     def detector(self) -> Detector:
@@ -74,23 +72,15 @@ class StatedCamera(Options):
 class StatedOptics(Options):
     """Optics of the spots, see `Question`."""
 
-    fwhm_px: Any = setting(None, "Width (FWHM) of the optical spot.", unit="px", group="spot", **positive)
+    fwhm_px: Any = setting(None, "Width (FWHM) of the optical spot.", unit="px", **_SPOT)
     profile: str = setting(
         "diffraction", "Shape of the spot; diffraction is sinc^2.", choices=PROFILES, group="spot"
     )
-    subaperture_m: Any = setting(
-        None, "Side of a sub-aperture in the telescope's pupil.", unit="m", group="spot", **positive
-    )
-    wavelength_nm: Any = setting(None, "Wavelength of the sensor.", unit="nm", group="spot", **positive)
-    pixel_scale_arcsec: Any = setting(
-        None, "Side of a pixel on the sky.", unit="arcsec", group="spot", **positive
-    )
+    subaperture_m: Any = setting(None, "Side of a sub-aperture in the telescope's pupil.", unit="m", **_SPOT)
+    wavelength_nm: Any = setting(None, "Wavelength of the sensor.", unit="nm", **_SPOT)
+    pixel_scale_arcsec: Any = setting(None, "Side of a pixel on the sky.", unit="arcsec", **_SPOT)
     r0_m: Any = setting(
-        None,
-        "Fried parameter at 500 nm: decides whether spots are speckled.",
-        unit="m",
-        group="spot",
-        **positive,
+        None, "Fried parameter at 500 nm: decides whether spots are speckled.", unit="m", **_SPOT
     )
 
     def width(self, psf: PSF | None, largest_px: float, fwhm_px: float | None) -> tuple[float, str]:

@@ -84,7 +84,7 @@ def promise_lines(answer: Answer) -> list[str]:
     """Describe how the recording compares with the promised error."""
     promise = answer.promise
     if promise is None:
-        return [UNCHECKED] if answer.question.facts else []
+        return [UNCHECKED] if answer.question.recorded.facts else []
     simulated = min(answer.results, key=lambda result: result.statistics.ranking_rms)
     factor = answer.promises[simulated.method.name].factor
     is_placed = not promise.contradicted and promise.expected_px > _PLACED * promise.promised_px
@@ -123,7 +123,7 @@ def foundations(answer: Answer) -> list[str]:
         speckled=bool(question.spots.d_over_r0),
     )
     not_tried = [f"{name} was not tried: {reason}" for name, reason in answer.left_out.items()]
-    return [*question.facts, *lines, *not_tried]
+    return [*question.recorded.facts, *lines, *not_tried]
 
 
 def gain_in_words(answer: Answer, gain: Estimate, *, sign: bool = False) -> str:
@@ -223,13 +223,13 @@ def _line(answer: Answer, result: MethodResult, magnitudes: NDArray[np.float64])
     drawn = {"color": style.colour, "ls": style.line, "marker": style.marker, "elinewidth": 1}
     drawn |= {"ms": 7, "lw": 3, "zorder": 4} if best else {"ms": 5, "lw": 1.6, "zorder": 3}
     label = f"{result.method.label} (recommended)" if best else result.method.label
-    return Line(label, magnitudes, result.error_px, result.standard_error_px, drawn)
+    name, curve = result.method.name, answer.curve
+    return Line(label, magnitudes, curve.of(name), curve.se_of(name), drawn)
 
 
 def _limits(answer: Answer, saturated: float) -> tuple[float, float]:
-    drawn = [result.error_px for result in answer.results]
-    lowest = min(float(np.min(drawn)), float(answer.bound_px.min()))
-    highest = min(float(np.max(drawn)), 2.5 * saturated)
+    lowest = min(float(answer.curve.error.min()), float(answer.bound_px.min()))
+    highest = min(float(answer.curve.error.max()), 2.5 * saturated)
     budget = answer.question.budget_px
     if budget is not None and lowest / 3 < budget < 3 * highest:
         lowest, highest = min(lowest, budget), max(highest, budget)

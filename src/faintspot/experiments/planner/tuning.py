@@ -229,8 +229,6 @@ class _Trial:
             MethodResult(
                 at_star[name].method,
                 at_star[name].statistics,
-                curve.of(name),
-                curve.se_of(name),
                 over(name, BrightestPixels),
                 over(name, Thresholded),
                 None if budget is None else limiting_flux(curve, name, budget, rng),
@@ -245,7 +243,7 @@ class _Trial:
     @cached_property
     def _promises(self) -> dict[str, Promise]:
         """The methods at the star's flux, checked on the recording."""
-        if self.question.recording is None:
+        if self.question.recorded.frames is None:
             return {}
         methods = {
             name: (scored.method, scored.statistics.error.value) for name, scored in self._scored[0].items()
