@@ -3,7 +3,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tests.experiments.experiment_cases import HERE, StopsAfter, assert_same_units, small
+from tests.experiments.experiment_cases import HERE, StopsAfter, assert_same_files, small
 
 from faintspot.base.errors import InputError
 from faintspot.experiments.night.protocol import NightPlan, load_night
@@ -78,7 +78,7 @@ def test_an_interrupted_night_goes_on(tmp_path: Path) -> None:
         run_night(LOOP, interrupted, plan=PLAN, pool=WorkerPool(0, StopsAfter(500)))
     assert not (interrupted / "night.zarr").exists()
     run_night(LOOP, interrupted, plan=PLAN, pool=HERE)
-    assert_same_units(whole, interrupted)
+    assert_same_files(whole, interrupted)
     with pytest.raises(InputError, match="--overwrite"):
         run_night(LOOP, interrupted, plan=replace(PLAN, keep_brightest=9), pool=HERE)
 

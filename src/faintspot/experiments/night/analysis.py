@@ -221,13 +221,14 @@ def hours_needed(effect: float, error: float, hours: float, shared_error: float 
     return hours * max(error**2 - shared_error**2, 0.0) / left if left > 0 else math.inf
 
 
-def group_means(night: Night, rows: Rows) -> list[tuple[float, float, int]]:
+def group_means(night: Night, rows: Rows) -> list[dict[str, float]]:
     """Return mean, standard deviation and number of some blocks in each set, and in all of them."""
     found = []
     for part in (*night.sets, np.ones_like(rows)):
         values = night.strehl[rows & part & np.isfinite(night.strehl)]
+        mean = float(values.mean()) if len(values) else math.nan
         scatter = float(values.std(ddof=1)) if len(values) > 1 else math.nan
-        found.append((float(values.mean()) if len(values) else math.nan, scatter, len(values)))
+        found.append({"mean": mean, "standard_deviation": scatter, "blocks": len(values)})
     return found
 
 
@@ -285,27 +286,29 @@ def verdicts(night: Night) -> list[NightVerdict]:
         best, every = found[BEST], found[ALL_STRENGTHS]
         verdict.append(_of_difference("best", by_name[BEST]))
         measured = contrast(night, best, every & ~best, seeing)
-        rows = every & np.isfinite(night.paired_strehl)
-        paired = UNKNOWN
+        rows, paired = every & np.isfinite(night.paired_strehl), UNKNOWN
         if (rows & best).any() and (rows & ~best).any():
             design = np.column_stack([best[rows], np.ones(int(rows.sum()))]).astype(np.float64)
             change = (night.strehl - night.paired_strehl)[rows]
             paired = coefficient(design, change, night.middle_s[rows], night.cycle[rows], 0)
-        effect = paired if math.isfinite(paired.value) else measured
         hours = float((night.duration_s[every] + night.overhead_s).sum()) / 3600
-        needed = hours_needed(effect.value, measured.standard_error, hours)
-        verdict.append(NightVerdict(_TEXT["statements.range"], measured, paired, "", needed))
+        verdict.append(_verdict("range", measured, paired, hours))
     fits = lines(night)
     if fits:
-        slope = fits[0].slope_per_cm
-        needed = hours_needed(slope.value, slope.standard_error, night.hours)
-        verdict.append(NightVerdict(_TEXT["statements.r0"], slope, UNKNOWN, " per cm", needed))
+        verdict.append(_verdict("r0", fits[0].slope_per_cm, UNKNOWN, night.hours, unit=" per cm"))
     return verdict
 
 
-def _of_difference(name: str, difference: Difference) -> NightVerdict:
-    paired = difference.paired or UNKNOWN
-    return NightVerdict(_TEXT[f"statements.{name}"], difference.measured, paired, "", difference.hours_needed)
+def _of_difference(name: str, found: Difference) -> NightVerdict:
+    return _verdict(name, found.measured, found.paired or UNKNOWN, found.hours, found.shared_error)
+
+
+def _verdict(
+    name: str, measured: Estimate, paired: Estimate, hours: float, shared_error: float = 0.0, unit: str = ""
+) -> NightVerdict:
+    effect = paired if math.isfinite(paired.value) else measured
+    needed = hours_needed(effect.value, measured.standard_error, hours, shared_error)
+    return NightVerdict(_TEXT[f"statements.{name}"], measured, paired, unit, needed)
 
 
 def _outcome(estimate: Estimate) -> str:

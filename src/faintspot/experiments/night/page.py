@@ -33,7 +33,7 @@ from faintspot.experiments.night.paper import (
     compare_with_paper,
     paper_exposures,
 )
-from faintspot.experiments.night.protocol import COUNTS, NIGHT_STORE, Night
+from faintspot.experiments.night.protocol import COUNTS, Night
 from faintspot.loop.simulation.configuration import LoopConfiguration
 
 Floats = NDArray[np.float64]
@@ -168,7 +168,6 @@ def _of_strengths(
 
 SUMMARY_FILE, PAGE_FILE = "night.json", "night.html"
 # Attributes in JSON.
-_MEAN = ("mean", "standard_deviation", "blocks")
 _DIFFERENCE = (
     "name",
     "blocks",
@@ -184,21 +183,20 @@ _VERDICT = ("statement", "outcome", "measured", "significance", "paired", "paire
 
 
 def write_night(night: Night, folder: str | Path) -> list[Path]:
-    """Write a night to a folder: `night.zarr`, `night.json` and `night.html`.
+    """Write the numbers and the page of a night to a folder: `night.json` and `night.html`.
 
     Raises
     ------
     InputError
         When a file cannot be written.
     MissingExtraError
-        When zarr, matplotlib or jinja2 is not installed.
+        When matplotlib or jinja2 is not installed.
     """
     folder = Path(folder)
-    night.save(folder / NIGHT_STORE)
     text = to_json(night_summary(night), indent=2)
     write_atomically(folder / SUMMARY_FILE, text + "\n")
     night_page(night).write(folder / PAGE_FILE)
-    return [folder / name for name in (NIGHT_STORE, SUMMARY_FILE, PAGE_FILE)]
+    return [folder / name for name in (SUMMARY_FILE, PAGE_FILE)]
 
 
 def night_summary(night: Night) -> dict[str, Any]:
@@ -214,7 +212,7 @@ def night_summary(night: Night) -> dict[str, Any]:
         ],
         "means": {
             name: [
-                {"set": where, **dict(zip(_MEAN, map(plain, values), strict=True))}
+                {"set": where, **{key: plain(value) for key, value in values.items()}}
                 for where, values in zip(sets, group_means(night, rows), strict=True)
             ]
             for name, rows in with_reference(night).items()
@@ -305,9 +303,12 @@ def _means_table(night: Night) -> page.Table:
     columns = [group_means(night, rows) for rows in named.values()]
     rows: list[list[str | page.TableCell]] = []
     for row, where in enumerate([*night.set_names, "all sets"]):
-        values = [dict(zip(_MEAN, column[row], strict=True)) for column in columns]
-        texts = [(_TEXT("night-means.cell", each), _TEXT("night-means.small", each)) for each in values]
-        rows.append([where, *(page.TableCell(text, small=small) for text, small in texts)])
+        values = [column[row] for column in columns]
+        cells = [
+            page.TableCell(_TEXT("night-means.cell", each), small=_TEXT("night-means.small", each))
+            for each in values
+        ]
+        rows.append([where, *cells])
     return _TEXT.table("night-means", rows, list(named))
 
 

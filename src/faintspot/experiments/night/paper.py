@@ -24,7 +24,7 @@ PAPER_SCATTERS = np.array(
 PAPER_CORRELATION = 0.38
 """Correlation of Strehl ratio and r0 of the exposures with TV."""
 _RANGES = np.arange(0.1, 1.55, 0.1)  # lower ends of other ranges as wide as the paper's
-_NIGHTS = 1000
+_NIGHTS, _SEED = 1000, 2015
 
 
 @dataclass(frozen=True)
@@ -147,9 +147,7 @@ def _mean(parts: Sequence[Estimate]) -> Estimate:
     return Estimate(float(np.mean([part.value for part in parts])), error)
 
 
-def chances_without_difference(
-    night: Night, excesses: Sequence[float], nights: int = _NIGHTS, seed: int = 2015
-) -> tuple[float, float, float]:
+def chances_without_difference(night: Night, excesses: Sequence[float]) -> tuple[float, float, float]:
     """Return how often nights without any difference show one, from synthetic nights of the same protocol.
 
     Each has the night's Strehl ratio as a parabola of the logarithm of r0, with the night's drift of r0 begun
@@ -162,8 +160,6 @@ def chances_without_difference(
     night : Night
     excesses : sequence of two floats
         Differences of all strengths and of `BEST_STRENGTHS`, in the mean of the sets.
-    nights : int
-    seed : int
 
     Returns
     -------
@@ -171,7 +167,7 @@ def chances_without_difference(
         Share of nights with these excesses or larger ones: of all strengths, of `BEST_STRENGTHS`, and of
         whichever range as wide as `BEST_STRENGTHS` has the largest.
     """
-    strehl = _synthetic_strehl(night, nights, np.random.default_rng(seed))
+    strehl = _synthetic_strehl(night, _NIGHTS, np.random.default_rng(_SEED))
 
     def excess(chosen: NDArray[np.bool_]) -> Floats:
         """Return the mean difference of the sets that have such blocks, (nights,)."""
