@@ -7,29 +7,18 @@ import numpy as np
 import xarray
 
 from faintspot.experiments.methods import keeps_every_k
+from faintspot.experiments.study.sweep import STANDARD
 from faintspot.slopes.estimators.registry import estimator_named
 
 METHODS = ("brightest", "tv", "smoothed", "thresholded")
 ESTIMATOR_METHODS = ("ml", "map", "weighted")
 MODES = ("best", "fixed20", "fixed40", "fixed60")
-DEFAULTS: dict[str, Any] = {
-    "flux_e": 100.0,
-    "read_noise_e": 0.1,
-    "profile": "diffraction",
-    "size": 1.0,
-    "elongation": 1.0,
-    "pixels": 16,
-    "position_range_px": 1.0,
-    "background_e": 0.0,
-    "em_gain": 1.0,
-    "d_over_r0": 0.0,
-}
 Cell = dict[str, Any]
 FLUXES_E = (10.0, 30.0, 80.0, 300.0, 1000.0)
 
 
 def cells(*, fluxes: Sequence[float] = FLUXES_E, **parameters: Any) -> list[Cell]:
-    return [{**DEFAULTS, **parameters, "flux_e": flux} for flux in fluxes]
+    return [{**STANDARD, **parameters, "flux_e": flux} for flux in fluxes]
 
 
 def power_law(gain: Callable[[Cell, str, str], float]) -> Callable[[Cell, str, str], float]:
@@ -97,7 +86,7 @@ def dataset(
         array = array.astype(float)
         array[~done] = np.nan
         data[name] = (dims, array)
-    coordinates = {name: ("cell", np.array([cell[name] for cell in every])) for name in DEFAULTS}
+    coordinates = {name: ("cell", np.array([cell[name] for cell in every])) for name in STANDARD}
     return xarray.Dataset(
         {**data, "done": ("cell", done)},
         coords={

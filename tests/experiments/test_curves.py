@@ -106,11 +106,6 @@ def test_standard_error_of_the_gain_covers_the_truth() -> None:
     assert sum(deviation < 0.5 for deviation in deviations) <= 42
 
 
-def test_gain_is_reproducible() -> None:
-    curve = with_scatter(5.0)
-    assert gain(curve, 100.0).low == gain(curve, 100.0).low
-
-
 def test_half_the_flux_is_three_quarters_of_a_magnitude() -> None:
     curve = with_scatter(5.0)
     found = magnitude_gain(curve, 100.0, np.random.default_rng(3), method="method", reference="reference")

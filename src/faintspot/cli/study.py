@@ -25,7 +25,7 @@ from faintspot.cli.output import (
 if TYPE_CHECKING:
     import xarray
 
-    from faintspot.experiments.night.protocol import Night
+    from faintspot.base.report.page import Report
     from faintspot.experiments.study.specification import StudySpecification
 
 
@@ -96,10 +96,12 @@ def command(
     if specification == _PAPER:
         _repeat_the_paper(target, quick, figures, where)
     elif specification == _ESTIMATORS:
+        require("loop", "matplotlib", "jinja2", purpose="faintspot study estimators")
+        from faintspot.experiments.report import study_report
         from faintspot.experiments.study.specification import estimators_study
 
-        require("loop", "matplotlib", "jinja2", purpose="faintspot study estimators")
-        _write_page(_measure(estimators_study(quick), target, **where), target)
+        dataset = _measure(estimators_study(quick), target, **where)
+        _write_page(study_report(dataset), derived(target, ".html"))
     else:
         from faintspot.experiments.study.specification import StudySpecification
 
@@ -112,7 +114,7 @@ def _repeat_the_paper(target: str, quick: bool, figures: tuple[str, ...], where:
     require("loop", "matplotlib", "jinja2", "hcipy", purpose="faintspot study paper")
     from faintspot.experiments.night.page import PAGE_FILE
     from faintspot.experiments.paper.claims import paper_markdown, paper_rows
-    from faintspot.experiments.report import night_folder
+    from faintspot.experiments.report import night_folder, study_report
     from faintspot.experiments.study.specification import FIGURES, NIGHT, paper_study
     from faintspot.loop.simulation.configuration import load_loop
 
@@ -127,7 +129,7 @@ def _repeat_the_paper(target: str, quick: bool, figures: tuple[str, ...], where:
     if _LOOP in figures:
         _map_the_loop(derived(target, "-map"), quick, **where)
     if dataset is not None:
-        _write_page(dataset, target, night)
+        _write_page(study_report(dataset, night), derived(target, ".html"))
     if dataset is None and night is None:
         return
     table = derived(target, ".md")
@@ -143,18 +145,13 @@ def _map_the_loop(
 
     with worker_pool("loop", workers, scheduler) as pool:
         cells = run_loop_map(folder, quick=quick, pool=pool, overwrite=overwrite)
-    page = folder / "report.html"
-    loop_map_page(cells).write(page)
-    click.echo(f"{page}: open it in a browser")
+    _write_page(loop_map_page(cells), folder / "report.html")
 
 
-def _write_page(dataset: xarray.Dataset, target: str, night: Night | None = None) -> None:
-    """Write the page of a study beside its store."""
-    from faintspot.experiments.report import study_report
-
-    page = derived(target, ".html")
-    study_report(dataset, night).write(page)
-    click.echo(f"{page}: open it in a browser")
+def _write_page(page: Report, path: Path) -> None:
+    """Write a page, and say where it is."""
+    page.write(path)
+    click.echo(f"{shlex.quote(str(path))}: open it in a browser")
 
 
 def _measure(
@@ -287,9 +284,7 @@ def magnitude(
     with worker_pool("loop", **processes) as pool:
         result = run_magnitude(loop, folder, methods, flux_e, quick=quick, pool=pool, overwrite=overwrite)
     click.echo(loop_summary(result))
-    page = Path(folder) / "report.html"
-    loop_page(result).write(page)
-    click.echo(f"{shlex.quote(str(page))}: open it in a browser")
+    _write_page(loop_page(result), Path(folder) / "report.html")
     if write_config is not None:
         beside = save_recommended(result, loop, write_config)
         click.echo(f"{write_config}: written, and {beside}, the loop with this star and gain")

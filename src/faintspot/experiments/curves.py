@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from faintspot.base.checks import number_between, numbers_between
 from faintspot.base.errors import InputError
-from faintspot.base.statistics import Estimate, magnitudes
+from faintspot.base.statistics import UNKNOWN, Estimate, magnitudes
 from faintspot.experiments.methods import crossings
 
 Floats = NDArray[np.float64]
@@ -82,12 +82,10 @@ class Curve:
 
     def at(self, flux_e: float, method: str) -> Estimate | None:
         """Return R at that flux; None when there is none."""
-        index = np.flatnonzero(np.isclose(self.flux_e, flux_e) & np.isfinite(self.of(method)))
-        return (
-            Estimate(float(self.of(method)[index[0]]), float(self.se_of(method)[index[0]]))
-            if index.size
-            else None
-        )
+        error = self.of(method)
+        for index in np.flatnonzero(np.isclose(self.flux_e, flux_e) & np.isfinite(error)):
+            return Estimate(float(error[index]), float(self.se_of(method)[index]))
+        return None
 
     def _index(self, method: str) -> int:
         if method not in self.methods:
@@ -201,7 +199,7 @@ def magnitude_gain(
     if method == reference:
         return Estimate(0.0, 0.0)
     gain = gain_at_flux(curve, flux_e, rng, method=method, reference=reference)
-    return Estimate(math.nan) if gain is None else gain.in_magnitudes
+    return UNKNOWN if gain is None else gain.in_magnitudes
 
 
 def limiting_flux(curve: Curve, method: str, budget_px: float, rng: np.random.Generator) -> Estimate:
@@ -221,7 +219,7 @@ def limiting_flux(curve: Curve, method: str, budget_px: float, rng: np.random.Ge
     budget_px = number_between("budget_px", budget_px, 0.0, low_open=True)
     knots, curves = _resampled(curve, method, method, rng)
     if not len(knots):
-        return Estimate(math.nan)
+        return UNKNOWN
     flux = np.exp(crossings(knots, curves[1], np.log(budget_px)))
     drawn = flux[1:][np.isfinite(flux[1:]) & (flux[1:] > 0)]
     is_known = 0 < flux[0] < np.inf and len(drawn) > 1

@@ -25,8 +25,9 @@ from faintspot.experiments.paper.figures import (
     sweep_figure,
     triple_picture,
 )
+from faintspot.experiments.study.curves import measured_profiles, names_of, shared_in_words
 from faintspot.experiments.study.specification import BEST, CORRECTED, StudySpecification
-from faintspot.experiments.study.sweep import PARAMETERS
+from faintspot.experiments.study.sweep import PARAMETERS, STANDARD
 from faintspot.slopes.spots.shapes import FWHM_OF_SIZE_1_PX
 
 if TYPE_CHECKING:
@@ -47,13 +48,11 @@ _SCALES: dict[str, dict[str, Any]] = {
         "y_ticks": (0.02, 0.03, 0.05, 0.07, 0.1, 0.15, 0.2, 0.3, 0.5, 0.7, 1, 2),
     },
 }
-_STANDARD = {"elongation": 1.0, "size": 1.0, "pixels": 16, "position_range_px": 1.0}
-_STANDARD |= {"background_e": 0.0, "em_gain": 1.0, "d_over_r0": 0.0}
 
 
 def compares_estimators(dataset: xarray.Dataset) -> bool:
     """Whether a study has methods that know the spot."""
-    return any(knows_the_spot(str(method)) for method in dataset["estimator"].values)
+    return any(map(knows_the_spot, names_of(dataset, "estimator")))
 
 
 @dataclass(frozen=True)
@@ -67,15 +66,10 @@ class _Group:
     @property
     def name(self) -> str:
         """A short name, different for every group."""
-        changed = {key: value for key, value in self.common.items() if value != _STANDARD.get(key, value)}
-        words = [f"{key.partition('_')[0]}{value:g}" for key, value in changed.items()]
+        numbers = {name: value for name, value in self.common.items() if name != "profile"}
+        changed = {name: value for name, value in numbers.items() if value != STANDARD[name]}
+        words = [f"{name.partition('_')[0]}{value:g}" for name, value in changed.items()]
         return "-".join([self.common["profile"], *words])
-
-    @property
-    def words(self) -> str:
-        """Parameters that the cells share."""
-        named = [claims.parameter_in_words(key, value) for key, value in self.common.items()]
-        return ", ".join(text for text in named if not text.startswith("no "))
 
 
 def estimator_figures(dataset: xarray.Dataset) -> Iterator[FigureWithData]:
@@ -112,7 +106,7 @@ def _groups(dataset: xarray.Dataset, axis: str, by: Sequence[str], *, speckled: 
 
 
 def _figure(kind: str, group: _Group, rows: list[list[Panel]]) -> FigureWithData:
-    title, caption = f"{_TEXT[f'{kind}.title']}: {group.words}", _TEXT(f"{kind}.caption")
+    title, caption = f"{_TEXT[f'{kind}.title']}: {shared_in_words(group.common)}", _TEXT(f"{kind}.caption")
     height = _ROW_HEIGHT * len(rows) + 0.9
     return FigureWithData.of(f"{kind}-{group.name}", title, caption, rows, height, heading=title)
 
@@ -122,7 +116,7 @@ def _panel(cells: xarray.Dataset, kind: str, axis: str, title: str) -> Panel:
     x, values = cells[axis].values, cells[kind]
     errors, scale = cells.get(f"{kind}_se"), {**axis_of_study(axis), **_SCALES[kind]}
     lines = []
-    for method in map(str, cells["estimator"].values):
+    for method in names_of(cells, "estimator"):
         error = None if errors is None else errors.sel(estimator=method).values
         style, line = style_of(method), "-" if knows_the_spot(method) else "--"
         drawn = {"color": style.colour, "marker": style.marker, "ms": 8 if style.marker == "*" else 5.5}
@@ -140,7 +134,7 @@ def _panel(cells: xarray.Dataset, kind: str, axis: str, title: str) -> Panel:
 
 def _corrected_mode(dataset: xarray.Dataset) -> str:
     """Return the mode whose settings are chosen for the gain-corrected rms, where the study has it."""
-    return CORRECTED if CORRECTED in dataset["mode"].values else BEST
+    return CORRECTED if CORRECTED in names_of(dataset, "mode") else BEST
 
 
 _TEXT = Texts("faintspot.experiments")
@@ -191,15 +185,27 @@ def study_report(dataset: xarray.Dataset, night: Night | None = None) -> Report:
     attributes = dataset.attrs
     done, total = int(dataset["done"].sum()), dataset.sizes["cell"]
     specification = StudySpecification.from_text(str(attributes["specification"]))
-    of_estimators = compares_estimators(dataset)
-    subject = "Slope errors of the estimators" if of_estimators else "Slope errors with and without TV"
+    figures = [Section(figure.name, figure.title, [figure]) for figure in study_figures(dataset)]
+    if compares_estimators(dataset):
+        subject = "Slope errors of the estimators"
+        sections = [*figures, claims.baselines_section(dataset)]
+    else:
+        subject = "Slope errors with and without TV"
+        sections = [
+            claims.paper_section(claims.paper_rows(dataset, night), claims.verdicts(dataset)),
+            _TEXT.section("sections.guidance", *claims.guidance(dataset)),
+            claims.baselines_section(dataset),
+            claims.gains_section(dataset),
+            *figures,
+            *([] if night is None else night_sections(night)),
+        ]
     version = attributes.get("faintspot_version", "unknown")
     values = {"done": done, "total": total, "widths": _widths_in_words(specification), "version": version}
     return Report(
         title=f"{subject}: study “{specification.name}”",
         facts=_TEXT.facts("study.facts", attributes, **values),
         sections=[
-            *(_of_estimators(dataset) if of_estimators else _of_claims(dataset, night)),
+            *sections,
             configuration_section(str(attributes["specification"]), "Specification"),
         ],
         warnings=_TEXT.lines("study.warnings", missing=(total - done) or None),
@@ -228,7 +234,7 @@ def study_figures(dataset: xarray.Dataset) -> Iterator[FigureWithData]:
                 yield figure
         elif cells:
             yield sweep_figure(dataset, cells, name, _TEXT["paper_figures"].get(name, name))
-    for profile in sorted({str(name) for name in dataset["profile"].values}):
+    for profile in measured_profiles(dataset):
         figure = baselines_figure(dataset, profile)
         if figure is not None:
             yield figure
@@ -259,25 +265,3 @@ def _widths_in_words(specification: StudySpecification) -> str:
     is_paper = _is_paper(sweep.name.split()[0] for sweep in specification.sweeps)
     largest = 2 * FWHM_OF_SIZE_1_PX["diffraction"] if is_paper else None
     return _TEXT("study.widths", widths=", ".join(widths), largest=largest)
-
-
-def _of_estimators(dataset: xarray.Dataset) -> list[Section]:
-    return [
-        *_figure_sections(dataset),
-        claims.baselines_section(dataset),
-    ]
-
-
-def _of_claims(dataset: xarray.Dataset, night: Night | None) -> list[Section]:
-    return [
-        claims.paper_section(claims.paper_rows(dataset, night), claims.verdicts(dataset)),
-        _TEXT.section("sections.guidance", *claims.guidance(dataset)),
-        claims.baselines_section(dataset),
-        claims.gains_section(dataset),
-        *_figure_sections(dataset),
-        *([] if night is None else night_sections(night)),
-    ]
-
-
-def _figure_sections(dataset: xarray.Dataset) -> list[Section]:
-    return [Section(figure.name, figure.title, [figure]) for figure in study_figures(dataset)]

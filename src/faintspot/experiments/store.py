@@ -19,7 +19,7 @@ from faintspot.base import __version__
 from faintspot.base.errors import InputError, load_package
 from faintspot.base.files import output_errors
 from faintspot.io.stored_array import one_line
-from faintspot.io.zarr_store import stored_attributes
+from faintspot.io.zarr_store import new_store, stored_attributes
 
 if TYPE_CHECKING:
     import xarray
@@ -96,7 +96,7 @@ class ZarrStore:
             if overwrite and self.path.exists():
                 shutil.rmtree(self.path)
             if not self.path.exists():
-                _create(zarr, self.path, {**own, _UNITS: list(units)}, template)
+                _create(self.path, {**own, _UNITS: list(units)}, template)
             for remains in self.path.rglob("*.partial"):  # of a program that was killed while it wrote
                 remains.unlink(missing_ok=True)
         try:
@@ -198,21 +198,18 @@ def _check_path(path: Path, attributes: Mapping[str, object], *, overwrite: bool
         )
 
 
-def _create(zarr: Any, path: Path, attributes: dict[str, Any], template: xarray.Dataset | None) -> None:
-    """Create the store under a hidden name and rename it, so that it is never seen half made."""
-    hidden = path.with_name(f".{path.name}.new")
-    shutil.rmtree(hidden, ignore_errors=True)
-    count = len(attributes[_UNITS])
-    if template is None:
-        group = zarr.create_group(str(hidden), zarr_format=3, attributes=attributes)
-        group.create_array(DONE, shape=(count,), chunks=(1,), dtype=bool, fill_value=False)
-    else:
+def _create(path: Path, attributes: dict[str, Any], template: xarray.Dataset | None) -> None:
+    """Create the store, so that it is never seen half made."""
+    with new_store(path, attributes) as group:
+        if template is None:
+            shape = (len(attributes[_UNITS]),)
+            group.create_array(DONE, shape=shape, chunks=(1,), dtype=bool, fill_value=False)
+            return
         encoding = {name: {"chunks": (1, *template[name].shape[1:])} for name in template.data_vars}
         # Zarr's format 3 knows texts of any length, but not NumPy's of a fixed one.
         texts = {name: c.astype(object) for name, c in template.coords.items() if c.dtype.kind == "U"}
         stored = template.assign_coords(texts).assign_attrs(attributes)
-        stored.to_zarr(hidden, mode="w", zarr_format=3, consolidated=False, encoding=encoding)
-    hidden.rename(path)
+        stored.to_zarr(group.store, mode="a", zarr_format=3, consolidated=False, encoding=encoding)
 
 
 def _chunk(array: Any, values: NDArray[np.generic]) -> NDArray[Any]:

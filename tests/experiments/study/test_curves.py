@@ -77,14 +77,6 @@ def test_without_a_curve_there_is_no_gain() -> None:
     assert gain_at_error(curve(), 100.0, rng, **TV_OVER_NO_TV) is None
 
 
-def test_paired_difference_uses_the_covariance() -> None:
-    item = curve(correlation=0.9)
-    difference, se = item.difference("tv", "brightest")
-    plain, tv = item.se_of("brightest"), item.se_of("tv")
-    np.testing.assert_allclose(se, np.sqrt(plain**2 + tv**2 - 1.8 * plain * tv))
-    np.testing.assert_allclose(difference, item.of("brightest") - item.of("tv"))
-
-
 def test_bad_input_is_refused() -> None:
     with pytest.raises(InputError, match="mode 'worst'"):
         study_curves(dataset(cells(), power_law(gain_of)), "worst")

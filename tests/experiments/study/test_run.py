@@ -7,10 +7,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tests.experiments.study_runs import N_CELLS, SPECIFICATION, assert_identical, assert_same
+from tests.experiments.experiment_cases import assert_same_files
+from tests.refusals import refused
 
-from faintspot import InputError, experiments
-from faintspot.experiments import StudySpecification, WorkerPool, measure_cell, open_study
+from faintspot import experiments
+from faintspot.experiments import StudySpecification, Sweep, WorkerPool, measure_cell, open_study
 
 pytest.importorskip("zarr")
 xarray = pytest.importorskip("xarray")
@@ -21,6 +22,17 @@ from faintspot.experiments.study.run import (  # noqa: E402
     new_dataset,
     stored_units,
 )
+
+SPECIFICATION = StudySpecification(
+    "small",
+    [
+        Sweep("flux", flux_e=[10, 30, 100, 300], pixels=[6, 8]),
+        Sweep("noise", read_noise_e=[0.1, 3], pixels=8),
+    ],
+    realisations=200,
+    fixed_k=(10, 40),
+)
+N_CELLS = 9  # 100 e- and 0.1 e- on 8 x 8 pixels is in both sweeps
 
 
 @pytest.fixture(scope="module")
@@ -40,7 +52,7 @@ def test_study_in_memory_equals_the_stored_one(uninterrupted: Path) -> None:
     result = experiments.run(SPECIFICATION, pool=counting(counts))
     assert counts == [(i, N_CELLS) for i in range(N_CELLS + 1)]
     assert result["done"].all()
-    assert_identical(result, experiments.open_study(uninterrupted))
+    xarray.testing.assert_identical(result, experiments.open_study(uninterrupted))
 
 
 @pytest.mark.slow
@@ -57,14 +69,14 @@ def test_interrupted_and_started_again(tmp_path: Path, uninterrupted: Path) -> N
     counts: list[tuple[int, ...]] = []
     experiments.run(SPECIFICATION, path, pool=counting(counts))
     assert counts == [(finished, N_CELLS) for finished in range(4, N_CELLS + 1)]
-    assert_same(path, uninterrupted)
+    assert_same_files(path, uninterrupted)
     experiments.run(SPECIFICATION, path, pool=counting(counts))
     assert len(counts) == N_CELLS - 4 + 1  # a complete study tells nothing
 
 
 def test_other_cells_do_not_matter(uninterrupted: Path) -> None:
     whole = experiments.open_study(uninterrupted)
-    sweep = experiments.Sweep("one", flux_e=[300, 30], pixels=8)
+    sweep = Sweep("one", flux_e=[300, 30], pixels=8)
     part = experiments.run(replace(SPECIFICATION, sweeps=[sweep]), pool=WorkerPool(0))
     for cell in range(2):
         chosen = (whole["flux_e"] == part["flux_e"][cell]) & (whole["pixels"] == 8)
@@ -75,13 +87,8 @@ def test_other_cells_do_not_matter(uninterrupted: Path) -> None:
 
 
 def test_study_refuses_wrong_arguments() -> None:
-    with pytest.raises(InputError, match="workers = -1"):
-        experiments.run(SPECIFICATION, pool=WorkerPool(-1))
-    with pytest.raises(InputError, match="expected a StudySpecification"):
+    with refused("expected a StudySpecification"):
         experiments.run("mine.toml")  # type: ignore[arg-type]
-
-
-OTHER = replace(SPECIFICATION, seed=2)
 
 
 def test_a_new_dataset_has_all_variables() -> None:
@@ -107,11 +114,11 @@ def test_a_new_dataset_has_all_variables() -> None:
 def test_store_is_memory(tmp_path: Path) -> None:
     path = tmp_path / "s.zarr"
     stored, memory = stored_units(SPECIFICATION, path), dict[str, Any]()
-    assert_identical(open_study(path), dataset_of(SPECIFICATION, memory))
+    xarray.testing.assert_identical(open_study(path), dataset_of(SPECIFICATION, memory))
     for index in (2, 0):
         results = measure_cell(SPECIFICATION.cells()[index], SPECIFICATION)
         stored[str(index)] = memory[str(index)] = results
-    assert_identical(open_study(path), dataset_of(SPECIFICATION, memory))
+    xarray.testing.assert_identical(open_study(path), dataset_of(SPECIFICATION, memory))
     assert [index for index in range(N_CELLS) if str(index) in stored] == [0, 2]
     # One chunk a cell and variable.
     assert sorted(p.name for p in (path / "error" / "c").iterdir()) == ["0", "2"]
@@ -124,23 +131,17 @@ def test_store_is_memory(tmp_path: Path) -> None:
     np.testing.assert_array_equal(opened["error"], dataset_of(SPECIFICATION, memory)["error"])
 
 
-def test_what_belongs_to_others_is_left_alone(tmp_path: Path) -> None:
-    path = tmp_path / "s.zarr"
+def test_what_is_no_study_of_this_version_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "folder").mkdir()
+    for wrong, found in (("folder", "something else"), ("nothing", "nothing")):
+        with refused(f"found {found}"):
+            open_study(tmp_path / wrong)
+    path, other = tmp_path / "s.zarr", replace(SPECIFICATION, seed=2)
     stored_units(SPECIFICATION, path)
-    with pytest.raises(InputError, match=r"s\.zarr: belongs to another study \('small'"):
-        stored_units(OTHER, path)
-    stored_units(OTHER, path, overwrite=True)
-    assert open_study(path).attrs["fingerprint"] == OTHER.fingerprint
-    folder = tmp_path / "folder"
-    folder.mkdir()
-    for wrong, found in ((folder, "something else"), (tmp_path / "nothing", "nothing")):
-        with pytest.raises(InputError, match=f"found {found}"):
-            open_study(wrong)
-
-
-def test_of_another_version(tmp_path: Path) -> None:
-    path = tmp_path / "s.zarr"
-    stored_units(SPECIFICATION, path)
+    with refused("s.zarr: belongs to another study ('small'"):
+        stored_units(other, path)
+    stored_units(other, path, overwrite=True)
+    assert open_study(path).attrs["fingerprint"] == other.fingerprint
     shutil.rmtree(path / "gain")
-    with pytest.raises(InputError, match="has no gain: measured by another version"):
+    with refused("has no gain: measured by another version"):
         open_study(path)

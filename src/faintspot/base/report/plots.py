@@ -7,7 +7,7 @@ import io
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import chain
-from typing import TYPE_CHECKING, Any, ParamSpec, Protocol, TypeVar
+from typing import Any, ParamSpec, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -16,16 +16,12 @@ from faintspot.base.checks import not_none
 from faintspot.base.errors import MissingExtraError
 from faintspot.base.files import csv_text
 
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
-
-
 try:
     import matplotlib
     from matplotlib.axes import Axes
     from matplotlib.axis import XAxis, YAxis
     from matplotlib.figure import Figure
+    from matplotlib.lines import Line2D
     from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 except ImportError:
     raise MissingExtraError("matplotlib", "report", "Drawing pictures") from None
@@ -410,8 +406,6 @@ def _places(figure: Figure, rows: Sequence[Sequence[Drawing]]) -> list[list[Any]
 
 
 def _add_legend(figure: Figure, handles: Sequence[Line], style: dict[str, Any], columns: int) -> None:
-    from matplotlib.lines import Line2D
-
     entries: dict[str, Any] = {line.label: Line2D([], [], **line.style) for line in handles}
     for axes in figure.axes:
         if axes.get_legend() is None:

@@ -26,6 +26,8 @@ from faintspot.experiments.study.curves import (
     StudyConditions,
     Verdict,
     against_tv,
+    names_of,
+    parameter_in_words,
     study_curves,
 )
 from faintspot.experiments.study.specification import BEST, CORRECTED
@@ -38,34 +40,27 @@ if TYPE_CHECKING:
 
 
 FIXED_MODE = "fixed40"
+_SEED = 2015  # of the bootstraps: the same study always gets the same verdicts
 
 
 def fixed_mode(dataset: xarray.Dataset) -> str:
     """Return the mode of one k for all methods that is shown: k = 40, or else the largest of the study."""
-    fixed = [str(name) for name in dataset["mode"].values if str(name).startswith("fixed")]
+    fixed = [name for name in names_of(dataset, "mode") if name.startswith("fixed")]
     return FIXED_MODE if FIXED_MODE in fixed or not fixed else fixed[-1]
 
 
-def verdicts(dataset: xarray.Dataset, seed: int = 2015) -> list[Verdict]:
-    """Return the verdict on every claim of the paper.
-
-    Parameters
-    ----------
-    dataset : xarray.Dataset
-        A study; cells that are not finished do not count.
-    seed : int
-        Of the bootstraps, so that the same study always gets the same verdicts.
-    """
-    modes = [str(name) for name in dataset["mode"].values]
-    if not {NO_TV, TV} <= {str(name) for name in dataset["estimator"].values}:
+def verdicts(dataset: xarray.Dataset) -> list[Verdict]:
+    """Return the verdict on every claim of the paper; cells that are not finished do not count."""
+    if not {NO_TV, TV} <= {*names_of(dataset, "estimator")}:
         return []
     results = []
     for number, (text, judge) in enumerate(zip(_TEXT["claims"], judges.JUDGES, strict=True), start=1):
         rule = text["rule"].format(level=LEVEL_PX, equal=judges.EQUAL)
         findings = []
         for mode in (BEST, fixed_mode(dataset)):
-            rng = np.random.default_rng([seed, number])
-            findings.append(Judgement(mode, judge(dataset, mode, rng) if mode in modes else []))
+            rng = np.random.default_rng([_SEED, number])
+            is_measured = mode in names_of(dataset, "mode")
+            findings.append(Judgement(mode, list(judge(dataset, mode, rng)) if is_measured else []))
         results.append(Verdict(number, text["claim"], rule, *findings))
     return results
 
@@ -85,20 +80,12 @@ class _Compared:
     over_gaussian: Gain | None
 
 
-def guidance(dataset: xarray.Dataset, seed: int = 2015) -> list[str]:
-    """Return paragraphs that say when a user should use TV.
-
-    Parameters
-    ----------
-    dataset : xarray.Dataset
-        A study with TV and brightest pixels; otherwise the only paragraph says so.
-    seed : int
-        Of the bootstraps.
-    """
-    methods = {str(method) for method in dataset["estimator"].values}
+def guidance(dataset: xarray.Dataset) -> list[str]:
+    """Return paragraphs that say when a user should use TV; one, without TV and brightest pixels."""
+    methods = {*names_of(dataset, "estimator")}
     if not {NO_TV, TV} <= methods:
         return [_TEXT["guidance.no_tv"]]
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(_SEED)
     curves = study_curves(dataset, BEST)
     best = _compared(curves, rng, SMOOTHING in methods)
     if not best:
@@ -181,12 +168,6 @@ def parameters_of(dataset: xarray.Dataset, cells: Sequence[int]) -> list[dict[st
     return [{name: column[cell].item() for name, column in columns.items()} for cell in cells]
 
 
-def parameter_in_words(name: str, value: object) -> str:
-    """Return a cell's parameter with its unit."""
-    standard, words = _TEXT["standard_parameters"].get(name, (None, ""))
-    return str(words) if value == standard else str(_TEXT[f"parameters.{name}"]).format(value)
-
-
 def in_words(names: Sequence[str], values: Sequence[object]) -> str:
     """Return parameters with their units."""
     return ", ".join(map(parameter_in_words, names, values))
@@ -224,7 +205,7 @@ def baselines_section(dataset: xarray.Dataset) -> Section:
             "undecided": row.cells - row.smaller - row.larger,
         }
         for mode in (BEST, fixed_mode(dataset))
-        if mode in dataset["mode"].values
+        if mode in names_of(dataset, "mode")
         for row in against_tv(dataset, mode)
     ]
     return _TEXT.section("baselines", _TEXT.table("baselines", records))
@@ -232,7 +213,7 @@ def baselines_section(dataset: xarray.Dataset) -> Section:
 
 def gains_section(dataset: xarray.Dataset) -> Section:
     """Return the section of the flux gain, for every way to choose the number of pixels."""
-    modes = [str(mode) for mode in dataset["mode"].values]
+    modes = names_of(dataset, "mode")
     rows = [
         [
             key.in_words(),
@@ -259,10 +240,10 @@ def gains_by_mode(dataset: xarray.Dataset) -> dict[StudyConditions, dict[str, Ga
     """
     rng = np.random.default_rng(0)  # of the bootstrap: the same study gives the same page
     table: dict[StudyConditions, dict[str, Gain | None]] = {}
-    for mode in dataset["mode"].values:
-        for configuration, curve in study_curves(dataset, str(mode)).items():
+    for mode in names_of(dataset, "mode"):
+        for configuration, curve in study_curves(dataset, mode).items():
             gain = gain_at_error(curve, LEVEL_PX, rng, **TV_OVER_NO_TV) if curve.has(TV, NO_TV) else None
-            table.setdefault(configuration, {})[str(mode)] = gain
+            table.setdefault(configuration, {})[mode] = gain
     return {key: gains for key, gains in table.items() if any(gain is not None for gain in gains.values())}
 
 
@@ -334,22 +315,20 @@ def paper_markdown(rows: Sequence[PaperRow]) -> str:
 
 
 def _row(part: str, verdict: Verdict, fixed: str) -> PaperRow:
-    outcomes = {case.outcome for finding in (verdict.best, verdict.fixed) for case in finding.cases}
+    named = (
+        (verdict.best, "best k", _TEXT["whole.best"]),
+        (verdict.fixed, f"k = {fixed}", _TEXT("whole.fixed", k=fixed)),
+    )
+    measured = [each for each in named if each[0].cases]
+    outcomes = {case.outcome for finding, *_ in measured for case in finding.cases}
     if not outcomes:
         return PaperRow(part, verdict.claim, verdict.rule, NOT_MEASURED, "", "")
-    condition = ""
-    if outcomes == {Outcome.HOLDS}:
-        word = HOLDS
-    else:
+    word, condition = HOLDS, ""
+    if outcomes != {Outcome.HOLDS}:
         word = HOLDS_IF if Outcome.HOLDS in outcomes else FAILS
-        shares = [(verdict.best, _TEXT["whole.best"]), (verdict.fixed, _TEXT("whole.fixed", k=fixed))]
-        condition = "; ".join(_share(finding, where) for finding, where in shares if finding.cases)
-    numbers = [
-        f"{name}: {_typical(finding)}"
-        for name, finding in (("best k", verdict.best), (f"k = {fixed}", verdict.fixed))
-        if finding.cases
-    ]
-    return PaperRow(part, verdict.claim, verdict.rule, word, condition, "; ".join(numbers))
+        condition = "; ".join(_share(finding, where) for finding, _, where in measured)
+    numbers = "; ".join(f"{name}: {_typical(finding)}" for finding, name, _ in measured)
+    return PaperRow(part, verdict.claim, verdict.rule, word, condition, numbers)
 
 
 def _share(finding: Judgement, where: str) -> str:

@@ -17,12 +17,11 @@ from faintspot.experiments.paper.claims import (
     grouped,
     in_words,
     mode_in_words,
-    parameter_in_words,
     parameters_of,
 )
-from faintspot.experiments.study.curves import kept_panels
+from faintspot.experiments.study.curves import kept_panels, measured_profiles, names_of, shared_in_words
 from faintspot.experiments.study.specification import BEST
-from faintspot.experiments.study.sweep import PARAMETERS
+from faintspot.experiments.study.sweep import PARAMETERS, STANDARD
 from faintspot.slopes.estimators.noise import suggested_strength, tv_denoise
 from faintspot.slopes.recorded.pictures import assembled
 from faintspot.slopes.sensor.layout import Layout
@@ -83,14 +82,14 @@ def sweep_figure(dataset: xarray.Dataset, cells: Sequence[int], name: str, title
             heading = f"{mode_in_words(mode)}: {profile} spots, positions within ±{reach:g} px"
             lines = _tv_lines(dataset.sel(mode=mode), named, styles, axis)
             panels[-1].append(Panel(lines, title=heading, **scale))
-    fixed = [parameter_in_words(key, table[0][key]) for key in PARAMETERS if key not in (*varied, axis)]
-    shown = ", ".join(words for words in fixed if not words.startswith("no "))
+    common = {key: table[0][key] for key in PARAMETERS if key not in (*varied, axis)}
+    fixed, shown = in_words(list(common), list(common.values())), shared_in_words(common)
     handles = {**_LEGEND, **{label: style for label, style in styles.items() if label}}
     height = _ROW_HEIGHT if len(styles) <= _FEW_LINES else 1.3 * _ROW_HEIGHT
     return FigureWithData.of(
         name,
         title,
-        _TEXT("sweep.caption", fixed=", ".join(fixed) or "nothing"),
+        _TEXT("sweep.caption", fixed=fixed or "nothing"),
         panels,
         height * len(panels) + 0.8,
         heading=f"{title}  ({shown})" if shown else title,
@@ -102,9 +101,9 @@ def sweep_figure(dataset: xarray.Dataset, cells: Sequence[int], name: str, title
 
 def kept_pixels_figure(dataset: xarray.Dataset) -> FigureWithData | None:
     """Draw R against the number of brightest pixels kept (the paper's figure 5); None without cells."""
-    profiles = sorted({str(p) for p in dataset["profile"].values[dataset["done"].values]})
-    rows_of_panels = [parts for profile in profiles if (parts := kept_panels(dataset, profile))]
-    if not rows_of_panels or not {NO_TV, TV} <= set(dataset["estimator"].values):
+    every = (kept_panels(dataset, profile) for profile in measured_profiles(dataset))
+    rows_of_panels = [parts for parts in every if parts]
+    if not rows_of_panels or not {NO_TV, TV} <= {*names_of(dataset, "estimator")}:
         return None
     panels: list[list[Panel]] = []
     fixed = fixed_mode(dataset).removeprefix("fixed")
@@ -132,7 +131,7 @@ def kept_pixels_figure(dataset: xarray.Dataset) -> FigureWithData | None:
 def baselines_figure(dataset: xarray.Dataset, profile: str) -> FigureWithData | None:
     """Draw R of every method over R without denoising, for the main read noises; None without cells."""
     cells = _main_cells(dataset, profile)
-    methods = [str(method) for method in dataset["estimator"].values if not knows_the_spot(str(method))]
+    methods = [method for method in names_of(dataset, "estimator") if not knows_the_spot(method)]
     if not cells or NO_TV not in methods or len(methods) < 2:
         return None
     panels: list[list[Panel]] = []
@@ -168,8 +167,7 @@ def _axis_of(table: list[dict[str, object]]) -> str:
 
 
 def _modes(dataset: xarray.Dataset) -> list[str]:
-    measured = [str(mode) for mode in dataset["mode"].values]
-    return [mode for mode in (BEST, fixed_mode(dataset)) if mode in measured]
+    return [mode for mode in (BEST, fixed_mode(dataset)) if mode in names_of(dataset, "mode")]
 
 
 def _styles(labels: Sequence[str]) -> dict[str, dict[str, Any]]:
@@ -229,8 +227,8 @@ def _over_k(dataset: xarray.Dataset, cell: int, label: str, colour: object) -> I
 
 def _main_cells(dataset: xarray.Dataset, profile: str) -> dict[float, list[int]]:
     """Return the cells of round Nyquist-sampled spots in 16 px, by read noise and flux."""
-    standard = {"profile": profile, "size": 1.0, "elongation": 1.0, "pixels": 16}
-    standard |= {"background_e": 0.0, "em_gain": 1.0, "d_over_r0": 0.0}
+    varied = ("flux_e", "read_noise_e", "position_range_px")
+    standard = {name: value for name, value in STANDARD.items() if name not in varied} | {"profile": profile}
     kept = dataset["done"].values & np.all(
         [dataset[name] == value for name, value in standard.items()], axis=0
     )

@@ -8,7 +8,7 @@ taken only where R without TV is below INFORMATIVE times that of an estimator th
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -23,9 +23,12 @@ from faintspot.experiments.study.curves import (
     StudyConditions,
     judged,
     kept_panels,
+    measured_profiles,
+    names_of,
     spread,
     study_curves,
 )
+from faintspot.experiments.study.sweep import STANDARD
 
 if TYPE_CHECKING:
     import xarray
@@ -47,13 +50,7 @@ _FREE = ("size", "elongation", "pixels", "background_e", "em_gain")
 
 def selected(curves: Curves, **parameters: float | str) -> list[tuple[StudyConditions, Curve]]:
     """Return curves by their parameters; others are size 1, round, 16 pixels, no background or EM."""
-    standard: dict[str, float | str] = {
-        "size": 1.0,
-        "elongation": 1.0,
-        "pixels": 16,
-        "background_e": 0.0,
-        "em_gain": 1.0,
-    }
+    standard = {name: STANDARD[name] for name in _FREE}
     required = {name: value for name, value in (standard | parameters).items() if value != "any"}
     return [
         (key, curve)
@@ -79,9 +76,8 @@ def largest_gain(
     return max(gains, key=lambda item: item[1].low, default=None)
 
 
-def thirty_equal_eighty(dataset: xarray.Dataset, mode: str, rng: np.random.Generator) -> list[Case]:
+def thirty_equal_eighty(dataset: xarray.Dataset, mode: str, rng: np.random.Generator) -> Iterator[Case]:
     """Compare TV at 30 e- with none at 80 e-."""
-    cases = []
     for key, curve in selected(study_curves(dataset, mode), read_noise_e=0.1):
         with_tv, without = curve.at(30, TV), curve.at(80, NO_TV)
         gain = gain_at_flux(curve, 80, rng, **TV_OVER_NO_TV)
@@ -89,26 +85,22 @@ def thirty_equal_eighty(dataset: xarray.Dataset, mode: str, rng: np.random.Gener
             continue
         words = {"tv": with_error(with_tv, 4), "plain": with_error(without, 4), "gain": gain.in_words()}
         finding = _TEXT("findings.thirty", **words)
-        cases.append(Case(key.in_words(), finding, _reaches(gain, 80 / 30)))
-    return cases
+        yield Case(key.in_words(), finding, _reaches(gain, 80 / 30))
 
 
-def two_to_three(dataset: xarray.Dataset, mode: str, rng: np.random.Generator) -> list[Case]:
+def two_to_three(dataset: xarray.Dataset, mode: str, rng: np.random.Generator) -> Iterator[Case]:
     """Look for the largest flux gain of every Nyquist-sampled configuration."""
-    cases = []
     for key, curve in selected(study_curves(dataset, mode)):
         largest = largest_gain(key, curve, rng)
         if largest is None:
             continue
         flux, gain = largest
         finding = f"largest gain {gain.in_words()}, {_in_magnitudes(gain)}, at {flux:g} e-"
-        cases.append(Case(key.in_words(), finding, _reaches(gain, 2.0)))
-    return cases
+        yield Case(key.in_words(), finding, _reaches(gain, 2.0))
 
 
-def small_spots(dataset: xarray.Dataset, mode: str, rng: np.random.Generator) -> list[Case]:
+def small_spots(dataset: xarray.Dataset, mode: str, rng: np.random.Generator) -> Iterator[Case]:
     """Compare the gains of spots of different size."""
-    cases = []
     curves = selected(study_curves(dataset, mode), size="any")
     for group in _grouped(curves, "size"):
         gains = _level_gains(group, rng)
@@ -120,13 +112,11 @@ def small_spots(dataset: xarray.Dataset, mode: str, rng: np.random.Generator) ->
         finding = _TEXT("findings.gain_level", level=LEVEL_PX, gains=words)
         holds = all(difference > _SIGMAS * error for difference, error in differences)
         fails = any(difference < -_SIGMAS * error for difference, error in differences)
-        cases.append(Case(_shared_words(gains, "size"), finding, judged(holds, not fails)))
-    return cases
+        yield Case(gains[0][0].in_words(without="size"), finding, judged(holds, not fails))
 
 
-def independent_of_pixels(dataset: xarray.Dataset, mode: str, rng: np.random.Generator) -> list[Case]:
+def independent_of_pixels(dataset: xarray.Dataset, mode: str, rng: np.random.Generator) -> Iterator[Case]:
     """Compare R in the largest and in the smallest window."""
-    cases = []
     curves = selected(study_curves(dataset, mode), read_noise_e=0.1, pixels="any")
     for group in _grouped(curves, "pixels"):
         (small_key, small), (large_key, large) = group[0], group[-1]
@@ -139,9 +129,8 @@ def independent_of_pixels(dataset: xarray.Dataset, mode: str, rng: np.random.Gen
             finding = f"R at {large_key.pixels} px / R at {small_key.pixels} px: {words}"
             within = abs(tv) - _SIGMAS * tv_error <= np.log1p(EQUAL)
             less = abs(plain) - abs(tv) > _SIGMAS * np.hypot(tv_error, plain_error)
-            condition = f"{flux:g} e-, {_words_without(large_key, 'pixels')}"
-            cases.append(Case(condition, finding, judged(bool(within), bool(less))))
-    return cases
+            condition = f"{flux:g} e-, {large_key.in_words(without='pixels')}"
+            yield Case(condition, finding, judged(bool(within), bool(less)))
 
 
 def _in_both(tv: tuple[float, float], plain: tuple[float, float]) -> str:
@@ -150,26 +139,22 @@ def _in_both(tv: tuple[float, float], plain: tuple[float, float]) -> str:
     return f"{with_tv} with TV, {without} without"
 
 
-def less_dependence_on_k(dataset: xarray.Dataset, mode: str, rng: np.random.Generator) -> list[Case]:
+def less_dependence_on_k(dataset: xarray.Dataset, mode: str, rng: np.random.Generator) -> Iterator[Case]:
     """Compare how much R changes with k."""
-    modes = [
-        str(name) for name in dataset["mode"].values if mode.startswith("fixed") and name.startswith("fixed")
-    ]
+    is_fixed = mode.startswith("fixed")
+    modes = [name for name in names_of(dataset, "mode") if is_fixed and name.startswith("fixed")]
     names = ", ".join(name.removeprefix("fixed") for name in modes) or f"{KEPT_RANGE[0]} to {KEPT_RANGE[1]}"
-    cases = []
-    for panel in (panel for profile in _profiles(dataset) for panel in kept_panels(dataset, profile)):
+    for panel in (panel for profile in measured_profiles(dataset) for panel in kept_panels(dataset, profile)):
         for label, cell in panel.cells:
             tv, plain = (spread(dataset, cell, method, modes) for method in (TV, NO_TV))
             if tv is not None and plain is not None:
                 finding = f"largest R / smallest R for k = {names}: {_in_both(tv, plain)}"
-                outcome = _less(plain[0] - tv[0], np.hypot(tv[1], plain[1]))
-                cases.append(Case(f"{label}; {panel.title}", finding, outcome))
-    return cases
+                less, limit = plain[0] - tv[0], _SIGMAS * np.hypot(tv[1], plain[1])
+                yield Case(f"{label}; {panel.title}", finding, judged(less > limit, abs(less) <= limit))
 
 
-def elongated(dataset: xarray.Dataset, mode: str, rng: np.random.Generator) -> list[Case]:
+def elongated(dataset: xarray.Dataset, mode: str, rng: np.random.Generator) -> Iterator[Case]:
     """Follow the gain of elongated spots with read noise."""
-    cases = []
     curves = [
         item
         for item in selected(study_curves(dataset, mode), elongation="any")
@@ -189,15 +174,13 @@ def elongated(dataset: xarray.Dataset, mode: str, rng: np.random.Generator) -> l
         if most is not None:
             finding += f"; most flux saved at 3 e- or more: {most[0]:.0f} % ({most[1]:.0f} to {most[2]:.0f})"
         grows = slope > _SIGMAS * error
-        cases.append(
-            Case(_shared_words(clear, "read_noise_e"), finding, judged(grows and reached, grows or reached))
+        yield Case(
+            clear[0][0].in_words(without="read_noise_e"), finding, judged(grows and reached, grows or reached)
         )
-    return cases
 
 
-def one_magnitude(dataset: xarray.Dataset, mode: str, rng: np.random.Generator) -> list[Case]:
+def one_magnitude(dataset: xarray.Dataset, mode: str, rng: np.random.Generator) -> Iterator[Case]:
     """Look for the largest gain at 16 e-."""
-    cases = []
     for key, curve in selected(study_curves(dataset, mode), read_noise_e=16.0, size="any"):
         gains = [(level, gain_at_error(curve, level, rng, **TV_OVER_NO_TV)) for level in _LEVELS_PX]
         bounded = [(level, gain) for level, gain in gains if gain is not None and gain.is_bounded]
@@ -205,19 +188,17 @@ def one_magnitude(dataset: xarray.Dataset, mode: str, rng: np.random.Generator) 
             continue
         level, gain = max(bounded, key=lambda item: item[1].low)
         finding = f"most at R = {level:g} px: {_in_magnitudes(gain)}"
-        cases.append(Case(key.in_words(), finding, _reaches(gain, 10**0.4)))
-    return cases
+        yield Case(key.in_words(), finding, _reaches(gain, 10**0.4))
 
 
-def never_worse(dataset: xarray.Dataset, mode: str, rng: np.random.Generator) -> list[Case]:
+def never_worse(dataset: xarray.Dataset, mode: str, rng: np.random.Generator) -> Iterator[Case]:
     """Compare R in every cell."""
     from scipy.stats import norm
 
     curves = study_curves(dataset, mode)
     total = sum(int(np.isfinite(curve.difference(TV, NO_TV)[0]).sum()) for curve in curves.values())
     limit = float(norm.isf(_FAMILY_FALSE_ALARM / max(total, 1)))
-    cases = []
-    for profile in _profiles(dataset):
+    for profile in measured_profiles(dataset):
         changes: list[tuple[float, float, str]] = []
         for key, curve in selected(curves, profile=profile, **dict.fromkeys(_FREE, "any")):
             difference, error = curve.difference(TV, NO_TV)
@@ -246,11 +227,10 @@ def never_worse(dataset: xarray.Dataset, mode: str, rng: np.random.Generator) ->
             least_error=100 * least_error,
             where=condition,
         )
-        cases.append(Case(f"{profile} spots", finding, judged(worse == 0, better > worse)))
-    return cases
+        yield Case(f"{profile} spots", finding, judged(worse == 0, better > worse))
 
 
-JUDGES: tuple[Callable[[xarray.Dataset, str, np.random.Generator], list[Case]], ...] = (
+JUDGES: tuple[Callable[[xarray.Dataset, str, np.random.Generator], Iterator[Case]], ...] = (
     thirty_equal_eighty,
     two_to_three,
     small_spots,
@@ -270,14 +250,6 @@ def _reaches(gain: Gain, claimed: float) -> Outcome:
 
 def _in_magnitudes(gain: Gain) -> str:
     return f"{with_interval(gain.in_magnitudes, 2)} mag"
-
-
-def _profiles(dataset: xarray.Dataset) -> list[str]:
-    return sorted({str(name) for name in dataset["profile"].values[dataset["done"].values]})
-
-
-def _less(difference: float, error: float) -> Outcome:
-    return judged(difference > _SIGMAS * error, abs(difference) <= _SIGMAS * error)
 
 
 def _difference(first: Gain, second: Gain) -> tuple[float, float]:
@@ -319,22 +291,9 @@ def _grouped(
     """Return groups of at least two curves that differ in one parameter only, by increasing value of it."""
     groups: dict[str, list[tuple[StudyConditions, Curve]]] = {}
     for key, curve in curves:
-        groups.setdefault(_words_without(key, varied), []).append((key, curve))
+        groups.setdefault(key.in_words(without=varied), []).append((key, curve))
     return [
         sorted(group, key=lambda item: float(getattr(item[0], varied)))
         for group in groups.values()
         if len(group) > 1
     ]
-
-
-def _shared_words(gains: list[tuple[StudyConditions, Gain]], varied: str) -> str:
-    return _words_without(gains[0][0], varied)
-
-
-def _words_without(key: StudyConditions, varied: str) -> str:
-    words = {
-        "size": f" of size {key.size:g}",
-        "pixels": f", {key.pixels} × {key.pixels} px",
-        "read_noise_e": f", {key.read_noise_e:g} e- read noise",
-    }
-    return key.in_words().replace(words[varied], "")

@@ -246,12 +246,13 @@ def _results(scores: Scores) -> dict[str, NDArray[np.generic]]:
                 estimate = getattr(statistics, name)
                 results[name][i, j] = estimate.value
                 results[f"{name}_se"][i, j] = estimate.standard_error
-    results |= _stated_over_actual(methods, scores)
-    return results | _results_at_k(cell, methods, scores) | _against_the_bound(cell, results["error"])
+    results |= _stated_over_actual(scores) | _results_at_k(scores)
+    return results | _against_the_bound(cell, results["error"])
 
 
-def _stated_over_actual(methods: Any, scores: Scores) -> dict[str, NDArray[Any]]:
+def _stated_over_actual(scores: Scores) -> dict[str, NDArray[Any]]:
     """Root mean squares of stated standard errors and of errors: their ratio, without outliers and with."""
+    methods = scores.methods.specification.estimators
     without, with_outliers = np.full((2, len(methods)), np.nan)
     for i, method in enumerate(methods):
         stated = scores.stated(method)
@@ -279,10 +280,10 @@ def _against_the_bound(cell: Cell, errors: Floats) -> dict[str, NDArray[Any]]:
     return {"bound": bounds[0], "bound_rms": bounds[1], "photon_efficiency": efficiency}
 
 
-def _results_at_k(cell: Cell, methods: Any, scores: Scores) -> dict[str, NDArray[Any]]:
+def _results_at_k(scores: Scores) -> dict[str, NDArray[Any]]:
     """R and its standard error for every k, at the candidate of mode "best"."""
-    errors, standard_errors = np.full((2, len(methods), cell.pixels**2 - 1), np.nan)
-    count = len(scores.truth)
+    methods, count = scores.methods.specification.estimators, len(scores.truth)
+    errors, standard_errors = np.full((2, len(methods), scores.methods.cell.pixels**2 - 1), np.nan)
     for i, method in enumerate(methods):
         if method in scores.sums:
             mean, mean_square = scores.sums[method] / count

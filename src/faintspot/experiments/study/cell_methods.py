@@ -197,7 +197,7 @@ def position_table(
     valid : (n, K) array, bool
         Whether there was flux. Where not, the position counts as (0, 0).
     """
-    prepared = _prepared(estimator, images)
+    prepared = np.ascontiguousarray(not_none(estimator.denoised(images))).reshape(len(images), -1)
     n, pixels = prepared.shape
     positions, valid = np.empty((n, pixels - 1, 2)), np.empty((n, pixels - 1), np.bool_)
     step = max(1, _TABLE_PIXELS // pixels)
@@ -239,12 +239,6 @@ def _brightest_first(images: Images) -> NDArray[np.int64]:
     keys = np.where(bits >> 31, bits, ~bits & 0x7FFFFFFF).astype(np.uint64)
     both = np.sort(keys << 32 | np.arange(images.shape[1], dtype=np.uint64), axis=1)
     return (both & 0xFFFFFFFF).astype(np.int64)
-
-
-def _prepared(estimator: KeepingBrightest, images: Images) -> Images:
-    """Return the images (n, pixels) in which the brightest pixels are found."""
-    denoised = not_none(estimator.denoised(images))
-    return np.ascontiguousarray(denoised).reshape(len(images), -1)
 
 
 def moments_of(positions: Floats, truth: Floats) -> Floats:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from enum import StrEnum
 from typing import TYPE_CHECKING, Any
@@ -11,11 +11,31 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.errors import InputError
+from faintspot.base.report.texts import Texts
 from faintspot.experiments.curves import Curve
 from faintspot.experiments.methods import TV
 
 if TYPE_CHECKING:
     import xarray
+
+
+_TEXT = Texts("faintspot.experiments")
+_USUAL = [words for _, words in _TEXT["standard_parameters"].values()]
+_IN_ORDER = (
+    "elongation", "read_noise_e", "pixels", "position_range_px", "background_e", "em_gain", "d_over_r0"
+)  # fmt: skip
+
+
+def parameter_in_words(name: str, value: object) -> str:
+    """Return a cell's parameter with its unit."""
+    standard, words = _TEXT["standard_parameters"].get(name, (None, ""))
+    return str(words) if value == standard else str(_TEXT[f"parameters.{name}"]).format(value)
+
+
+def shared_in_words(values: Mapping[str, object]) -> str:
+    """Return parameters with their units, without those that are not there."""
+    named = (parameter_in_words(name, value) for name, value in values.items())
+    return ", ".join(text for text in named if not text.startswith("no "))
 
 
 @dataclass(frozen=True, order=True)
@@ -37,23 +57,23 @@ class StudyConditions:
         """R of an estimator that always answers the centre: half of the range."""
         return self.position_range_px / 2
 
-    def in_words(self) -> str:
-        """Return the configuration in one line."""
-        words = [
-            f"{self.profile} spot of size {self.size:g}",
-            f"{self.read_noise_e:g} e- read noise",
-            f"{self.pixels} × {self.pixels} px",
-            f"±{self.position_range_px:g} px",
-        ]
-        if self.elongation != 1:
-            words.insert(1, f"elongated {self.elongation:g} times")
-        if self.background_e:
-            words.append(f"background {self.background_e:g} e-/px")
-        if self.em_gain != 1:
-            words.append(f"EM gain {self.em_gain:g}")
-        if self.d_over_r0:
-            words.append(f"d/r0 {self.d_over_r0:g}")
-        return ", ".join(words)
+    def in_words(self, without: str = "") -> str:
+        """Return the configuration in one line, without one of its parameters."""
+        size = "" if without == "size" else f" of size {self.size:g}"
+        words = {name: parameter_in_words(name, getattr(self, name)) for name in _IN_ORDER}
+        words["position_range_px"] = f"±{self.position_range_px:g} px"
+        unusual = [text for name, text in words.items() if name != without and text not in _USUAL]
+        return ", ".join([f"{self.profile} spot{size}", *unusual])
+
+
+def names_of(dataset: xarray.Dataset, coordinate: str) -> list[str]:
+    """Return the names of a study's methods ("estimator") or modes ("mode")."""
+    return [str(name) for name in dataset[coordinate].values]
+
+
+def measured_profiles(dataset: xarray.Dataset) -> list[str]:
+    """Return the spot profiles of finished cells, in order."""
+    return sorted({str(name) for name in dataset["profile"].values[dataset["done"].values]})
 
 
 def study_curves(dataset: xarray.Dataset, mode: str) -> dict[StudyConditions, Curve]:
@@ -64,10 +84,9 @@ def study_curves(dataset: xarray.Dataset, mode: str) -> dict[StudyConditions, Cu
     InputError
         For a mode that the study does not have.
     """
-    modes = [str(name) for name in dataset["mode"].values]
-    if mode not in modes:
+    if mode not in (modes := names_of(dataset, "mode")):
         raise InputError(f"mode {mode!r}: expected one of {', '.join(modes)}")
-    methods = tuple(str(name) for name in dataset["estimator"].values)
+    methods = tuple(names_of(dataset, "estimator"))
     of_mode = dataset[["error", "error_covariance"]].sel(mode=mode)
     error = of_mode["error"].transpose("cell", "estimator").values
     covariance = of_mode["error_covariance"].transpose("cell", "estimator", "estimator2").values

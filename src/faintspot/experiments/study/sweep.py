@@ -4,14 +4,14 @@ import hashlib
 import itertools
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from typing import Any
 
 import numpy as np
 
-from faintspot.base.checks import numbers_between, one_of
+from faintspot.base.checks import one_of
 from faintspot.base.errors import InputError
-from faintspot.base.options import Option
+from faintspot.base.options import LIST, Option
 from faintspot.slopes.camera.detector import Detector
 
 PROFILES = ("diffraction", "gaussian")
@@ -171,6 +171,10 @@ class Sweep:
         return [Cell(*values) for values in itertools.product(*(getattr(self, name) for name in PARAMETERS))]
 
 
+STANDARD: dict[str, Any] = {item.name: item.default for item in fields(Sweep) if item.name in PARAMETERS}
+"""Values of parameters that a sweep does not list."""
+
+
 def _values(where: str, name: str, values: Any) -> tuple[Any, ...]:
     """Return the values of a parameter, checked, each once and in the order given."""
     items: Sequence[Any] = [values] if isinstance(values, str) or np.ndim(values) == 0 else list(values)
@@ -178,14 +182,4 @@ def _values(where: str, name: str, values: Any) -> tuple[Any, ...]:
         raise InputError(f"{where}: expected at least one value, got an empty list")
     if name == "profile":
         return tuple(dict.fromkeys(one_of(where, item, PROFILES) for item in items))
-    return tuple(dict.fromkeys(checked_numbers(where, items, RANGES[name])))
-
-
-def checked_numbers(where: str, items: object, bounds: Option) -> list[object]:
-    """Return plain numbers within the bounds, or raise InputError."""
-    kind = {"low_open": bounds.low_open, "integer": bounds.whole}
-    array = numbers_between(where, items, bounds.low, bounds.high, **kind)
-    if array.ndim != 1:
-        raise InputError(f"{where}: expected a list of numbers, got shape {array.shape}")
-    numbers: list[object] = array.tolist()
-    return numbers
+    return tuple(dict.fromkeys(replace(RANGES[name], kind=LIST).checked(where, items)))
