@@ -14,7 +14,7 @@ from tests.slopes.sensor.sensor_cases import spot_frame
 from faintspot import Calibration, Layout, Settings
 from faintspot.base.errors import DoubtWarning
 from faintspot.io import read_slopes
-from faintspot.slopes.simulate import Detector, sensor_frames
+from faintspot.slopes.simulate import Detector
 
 pytest.importorskip("matplotlib")
 
@@ -30,20 +30,10 @@ def lattice(geometry: str) -> NDArray[np.float64]:
     return np.stack([13.3 + 20 * columns + 10 * (rows % 2), 22.6 + 20 * np.sqrt(0.75) * rows], axis=1)
 
 
-def frames(geometry: str = "square", n_frames: int = 3) -> NDArray[Any]:
-    """Frames with spots of 2000 e- near the lattice points, 3 e- of read noise, an offset of 100 ADU."""
-    points = lattice(geometry)
-    corners = np.floor(points[:, ::-1]).astype(int) - 7
-    wanted = points - (corners[:, ::-1] + 7.5)
-    simulated, _ = sensor_frames(
-        Layout(SHAPE, (16, 16), corners),
-        n_frames,
-        flux_e=2000.0,
-        positions=np.tile(wanted, (n_frames, 1, 1)),
-        detector=Detector(3.0, offset_adu=OFFSET_ADU, bits=16),
-        rng=np.random.default_rng(1),
-    )
-    return np.asarray(simulated)
+def frames(geometry: str = "square", n_frames: int = 3) -> NDArray[np.float64]:
+    """Frames with spots of 2000 e- at the lattice points, 3 e- of read noise, an offset of 100 ADU."""
+    nodes = np.asarray(lattice(geometry) @ [1, 1j], np.complex128)
+    return np.stack([spot_frame(nodes, SHAPE, flux_e=2000.0, seed=seed) for seed in range(n_frames)])
 
 
 DOUBTS = pytest.mark.filterwarnings("ignore::faintspot.base.errors.DoubtWarning")

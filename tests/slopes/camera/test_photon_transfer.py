@@ -121,20 +121,15 @@ def test_flickering_brightness_is_taken_out() -> None:
     assert found.gain_e_per_adu.value == pytest.approx(2.0, rel=0.08)
 
 
-@pytest.mark.parametrize("movement_px", [0.3, 1.0])
-def test_too_much_movement_is_said(movement_px: float) -> None:
-    frames, darks = recorded(CAMERA, 5000.0, movement_px=movement_px)
-    found = measure_detector(frames, darks, layout=LAYOUT)
+@pytest.mark.parametrize(
+    ("flux_e", "movement_px", "note"),
+    [(5000.0, 0.3, "moves too much"), (5000.0, 1.0, "moves too much"), (2.0, 0.0, "more flux")],
+)
+def test_movement_and_flux_without_a_gain_are_said(flux_e: float, movement_px: float, note: str) -> None:
+    found = measure_detector(*recorded(CAMERA, flux_e, movement_px=movement_px), layout=LAYOUT)
     assert not found.reliable
-    assert "moves too much" in found.notes[-1]
+    assert note in found.notes[-1]
     assert found.read_noise_adu.value == pytest.approx(2.5, rel=0.02)
-
-
-def test_flux_too_faint_for_a_gain_is_said() -> None:
-    frames, darks = recorded(CAMERA, 2.0, n_frames=10)
-    found = measure_detector(frames, darks)
-    assert not found.reliable
-    assert "more flux" in found.notes[-1]
 
 
 def test_saturation_is_said_and_a_range_avoids_it() -> None:

@@ -25,6 +25,12 @@ class Windows:
         return len(self.corners)
 
 
+def lattice(shape: tuple[int, int], pitch_px: float, start: tuple[float, float]) -> NDArray[np.complex128]:
+    """Return the nodes x + 1j * y of a square lattice, row by row."""
+    row, column = np.indices(shape).reshape(2, -1)
+    return np.asarray(complex(*start) + pitch_px * (column + 1j * row), np.complex128)
+
+
 def spot_frame(
     nodes: NDArray[np.complex128],
     shape: tuple[int, int],
@@ -33,10 +39,9 @@ def spot_frame(
     spread_px: float = 0.0,
     width_px: float = 1.2,
     seed: int = 1,
-    n_frames: int = 1,
     **detector: Any,
 ) -> NDArray[Any]:
-    """Return the mean frame of Gaussian spots scattered about nodes x + 1j * y (n,), in ADU.
+    """Return a frame of Gaussian spots scattered about nodes x + 1j * y (n,), in ADU.
 
     Spots (of one flux or n, of this standard deviation) may lie at the frame's edge, which cuts them. The
     detector has 3 e- of read noise unless its options say otherwise.
@@ -51,15 +56,15 @@ def spot_frame(
     windows: Any = Windows(corners, (side, side), (shape[0] + 2 * margin, shape[1] + 2 * margin))
     frames, _ = sensor_frames(
         windows,
-        n_frames,
+        1,
         flux_e=flux_e,
         profile="gaussian",
         size=width_px * 1.1774,  # its full width at half maximum is 2 px times the size
-        positions=np.tile(wanted, (n_frames, 1, 1)),
+        positions=wanted[np.newaxis],
         detector=Detector(**options),
         rng=rng,
     )
-    return np.asarray(frames[:, margin:-margin, margin:-margin].mean(axis=0))
+    return np.asarray(frames[0, margin:-margin, margin:-margin], np.float64)
 
 
 class Sensor:

@@ -4,27 +4,18 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 from tests.refusals import refused
-from tests.slopes.sensor.sensor_cases import spot_frame
+from tests.slopes.sensor.sensor_cases import lattice, spot_frame
 
 import faintspot as fs
 from faintspot.slopes.sensor import windows
 from faintspot.slopes.sensor.found_layout import find_layout
 
 
-def nodes(
-    shape: tuple[int, int], pitch_px: float, start: tuple[float, float], angle_deg: float = 0.0
-) -> NDArray[np.complex128]:
-    row, column = np.indices(shape)
-    step = pitch_px * np.exp(1j * np.radians(angle_deg))
-    return np.asarray(complex(*start) + step * (column + 1j * row)).ravel()
-
-
 @pytest.mark.parametrize("seed", range(4))
 def test_windows_stay_on_their_spots_at_the_edge(seed: int) -> None:
     """The first column's windows do not fit: they are left out, the others are where they were."""
-    at = nodes((7, 7), 20.0, (6.0, 12.0))
+    at = lattice((7, 7), 20.0, (6.0, 12.0))
     frame = spot_frame(at, (144, 140), flux_e=5000.0, spread_px=0.5, seed=seed)
     found = find_layout(frame)
     assert len(found.layout) == 42
@@ -42,7 +33,7 @@ def test_windows_stay_on_their_spots_at_the_edge(seed: int) -> None:
 def test_a_pitch_of_whole_pixels_gives_windows_of_that_many(pitch_px: float, seed: int) -> None:
     # Single spots 0.28 and 0.34 pitches from their nodes were followed, with smaller windows.
     start = np.random.default_rng(seed).uniform(14, 16, 2)
-    at = nodes((10, 10), pitch_px, (start[0], start[1]))
+    at = lattice((10, 10), pitch_px, (start[0], start[1]))
     frame = spot_frame(at, (240, 240), flux_e=3000.0, spread_px=0.06 * pitch_px, seed=seed)
     layout = fs.Layout.from_frame(frame)
     assert layout.window == (round(pitch_px), round(pitch_px))
@@ -75,13 +66,13 @@ def test_windows_of_any_lattice_do_not_overlap(
 
 
 def test_a_window_may_be_oblong() -> None:
-    frame = spot_frame(nodes((6, 6), 20.0, (20.0, 20.0)), (140, 140), flux_e=5000.0)
+    frame = spot_frame(lattice((6, 6), 20.0, (20.0, 20.0)), (140, 140), flux_e=5000.0)
     layout = fs.Layout.from_frame(frame, pixels=(10, 18))
     assert layout.window == (10, 18)
     assert np.abs(layout.offsets).max() <= 0.51
 
 
 def test_no_window_fits() -> None:
-    frame = spot_frame(nodes((5, 5), 10.0, (9.0, 9.0)), (58, 58), flux_e=5000.0)
+    frame = spot_frame(lattice((5, 5), 10.0, (9.0, 9.0)), (58, 58), flux_e=5000.0)
     with refused("the windows of all 25 lenslets found leave the frame", "pixels < 60"):
         fs.Layout.from_frame(frame, pixels=60)

@@ -6,7 +6,7 @@ import pytest
 from numpy.typing import NDArray
 from tests.refusals import refused
 from tests.shared_data import shared_file
-from tests.slopes.sensor.sensor_cases import Sensor, check_regular, spot_frame
+from tests.slopes.sensor.sensor_cases import Sensor, check_regular, lattice, spot_frame
 
 from faintspot.base.errors import InputError
 from faintspot.slopes.sensor.detection.lenslets import find_lenslets
@@ -188,28 +188,20 @@ def test_reference_frame_is_illuminated_all_over() -> None:
 )
 def test_sharp_spots_on_a_clipped_background_are_not_hot(width_px: float, photons: float, seed: int) -> None:
     """Half of them look like hot pixels: most neighbours are 0. 30 real ones are as bright as spots."""
-    rng = np.random.default_rng(seed)
-    side, pitch = 258, 17.0
-    nodes = (side - 1) / 2 + pitch * (np.arange(14) - 6.5)
-    x, y = (axis.ravel() + rng.normal(0, 0.3, 196) for axis in np.meshgrid(nodes, nodes))
-    pixel = np.arange(side)
-    rows = np.exp(-0.5 * ((pixel - y[:, None]) / width_px) ** 2)
-    columns = np.exp(-0.5 * ((pixel - x[:, None]) / width_px) ** 2)
-    image = photons / (2 * np.pi * width_px**2) * rows.T @ columns
-    image[tuple(rng.integers(0, side, (2, 30)))] += photons
-    frame = np.clip(np.round(rng.poisson(image) + rng.normal(0, 0.2, image.shape)), 0, None).astype(np.uint16)
-    found = find_lenslets(frame)
+    nodes = lattice((14, 14), 17.0, (18.0, 18.0))
+    shape: dict[str, Any] = {"flux_e": photons, "spread_px": 0.3, "width_px": width_px, "seed": seed}
+    frame = spot_frame(nodes, (258, 258), **shape, read_noise_e=0.2, offset_adu=0.0)
+    frame[tuple(np.random.default_rng(seed).integers(0, 258, (2, 30)))] += photons
+    found = find_lenslets(frame.astype(np.uint16))
     assert found.doubt == ""
     assert len(found.cells) >= 195
-    assert found.pitch_px == pytest.approx(pitch, rel=0.005)
+    assert found.pitch_px == pytest.approx(17.0, rel=0.005)
 
 
 @pytest.mark.parametrize("place", ["beside the pupil", "far away", "between the spots"])
 def test_a_spot_that_was_taken_for_a_hot_pixel_is_listed(place: str) -> None:
     """A bright pixel at the node of a dark lenslet of the pupil's edge may be its spot, others are not."""
-    rows, columns = np.mgrid[:6, :6]
-    nodes: NDArray[np.complex128] = 20.0 + 12.0 * columns + 1j * (20.0 + 12.0 * rows)
-    frame = spot_frame(nodes.ravel()[1:], (150, 150), flux_e=4000.0)
+    frame = spot_frame(lattice((6, 6), 12.0, (20.0, 20.0))[1:], (150, 150), flux_e=4000.0)
     y, x = {"beside the pupil": (20, 20), "far away": (140, 140), "between the spots": (50, 50)}[place]
     frame[y, x] += 2000.0
     expected = [[20.0, 20.0]] if place == "beside the pupil" else []
