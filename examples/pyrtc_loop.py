@@ -92,7 +92,7 @@ def engine(folder: str) -> Iterator[None]:
 
 def slopes_stream() -> Any:
     """Open the stream of slopes, once frames are measured; the engine may have to compile."""
-    for _ in range(600):
+    for _ in range(1800):
         try:
             stream = open_stream(f"{NAME}_slopes")
         except FileNotFoundError:
@@ -100,7 +100,7 @@ def slopes_stream() -> Any:
         if stream is not None and stream.count:
             return stream
         time.sleep(0.1)
-    raise SystemExit("no slopes within a minute")
+    raise SystemExit("no slopes within three minutes")
 
 
 def main() -> None:
