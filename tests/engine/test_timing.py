@@ -11,12 +11,12 @@ from faintspot.engine.timing import (
     OTHER,
     PAGE_FAULT,
     PREPARING,
-    RESOLUTION,
     WOKEN_LATE,
     Latencies,
     Lateness,
 )
 
+RESOLUTION = 1 / 256
 # From nothing to 130 s, each order of magnitude as likely as the others.
 durations = st.integers(0, 37).flatmap(lambda bits: st.integers(0, 2**bits - 1))
 many = st.lists(durations, min_size=1, max_size=300)

@@ -260,7 +260,7 @@ class ControlLoop:
         """
         if kind in self._ready:
             return
-        self._ready[kind] = _prepared(self.control.with_controller(kind))
+        self._ready[kind] = PreparedController.of(self.control.with_controller(kind))
 
     def renew(self, model: Kalman) -> None:
         """Replace the model of a learnt controller.
@@ -272,7 +272,7 @@ class ControlLoop:
         InputError
             When the model is for another loop, or its commands are not finite.
         """
-        ready = _prepared(self.control.with_model(model))
+        ready = PreparedController.of(self.control.with_model(model))
         if ready.controller.is_guarded:
             self._successor = ControllerSuccessor(ready)
         else:
@@ -370,11 +370,3 @@ class ControlLoop:
         self.follow(Slopes(*(np.zeros(n, kind) for kind in RESULT_TYPES)), -1)
         self.closed, self._begins = False, False
         self._line.hold(commands)
-
-
-def _prepared(control: Control) -> PreparedController:
-    """Return the controller; refuse one whose commands are not finite."""
-    control.rehearse()
-    # A learnt controller may not know its errors while its integrator is used.
-    with np.errstate(all="ignore"):
-        return PreparedController.of(control)

@@ -206,8 +206,17 @@ class PreparedController(NamedTuple):
 
     @classmethod
     def of(cls, control: Control) -> Self:
-        """Return the configured controller, with a delay line of its own."""
-        controller = control.controller(control.line())
+        """Return the configured controller, with a delay line of its own.
+
+        Raises
+        ------
+        InputError
+            When its commands are not finite.
+        """
+        control.rehearse()
+        # A learnt controller may not know its errors while its integrator is used.
+        with np.errstate(all="ignore"):
+            controller = control.controller(control.line())
         predicts = control.prediction == CONTROLLER
         return cls(control.options.controller, controller, predicts, control.centroid_gain)
 

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass
 from itertools import chain
-from typing import TYPE_CHECKING, Any, Protocol, Self, TypedDict
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,14 +28,6 @@ _SPIN_NS = 150_000  # a sleep may overrun by this much; the last part is a busy 
 _BETWEEN_REPORTS_NS = 100_000_000
 LATE = 0.1
 """Delay, as a fraction of the frame time, beyond which a frame counts as late."""
-
-
-class StopEvent(Protocol):
-    """Event that stops a camera: threading.Event or multiprocessing.Event."""
-
-    def is_set(self) -> bool:
-        """Return whether to stop."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -63,13 +55,6 @@ class CameraReport:
     def frame_rate_hz(self) -> float:
         """Frames published per second."""
         return self.frames / self.seconds if self.seconds else 0.0
-
-
-class RowTimes(TypedDict, total=False):
-    """Options of a `Readout` that say when rows arrive."""
-
-    readout_fraction: float
-    rows_per_block: int
 
 
 class Readout(ABC):
@@ -140,7 +125,7 @@ class Readout(ABC):
     def run(
         self,
         n_frames: int | None = None,
-        stop: StopEvent | None = None,
+        stop: threading.Event | None = None,
         progress: Callable[[int], None] | None = None,
     ) -> CameraReport:
         """Publish frames until `n_frames` are out, the source ends or `stop` is set; a later call continues.
@@ -295,12 +280,12 @@ class Replay(Readout):
         self._chunks = self._converted()
         self._reader = ThreadPoolExecutor(1, "faintspot-reader")
         self._ahead: deque[Future[NDArray[np.generic] | None]] = deque()
-        self._stop: StopEvent = threading.Event()
+        self._stop: threading.Event = threading.Event()
 
     def run(
         self,
         n_frames: int | None = None,
-        stop: StopEvent | None = None,
+        stop: threading.Event | None = None,
         progress: Callable[[int], None] | None = None,
     ) -> CameraReport:
         """Publish frames as `Readout.run` does; the schedule starts when the first frame has been read.

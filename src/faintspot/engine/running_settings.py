@@ -257,15 +257,15 @@ class RunningSettings(Generic[Prepared]):
         Raises
         ------
         InputError
-            When a name is unknown.
+            When a name is unknown, or of another estimator than the configured one.
         """
         running = self.running
         n, pixels = len(running.layout), running.layout.pixels
         settings = running.settings
         check_names(names)
         for name in names or ():
-            if name != "estimator":
-                check_shared_or_own(name, settings)
+            if name not in ("estimator", *Settings.SHARED):
+                check_option(name, type(settings.estimator))
         asked_names = names or ["estimator", *settings.declared()]
         return {name: _plain(settings, name, n, pixels) for name in asked_names}
 
@@ -282,18 +282,6 @@ def check_names(names: Sequence[str] | None) -> None:
         raise InputError(f"names = {names!r}: expected a list of settings' names")
     for name in names or ():
         check_known("settings.", str(name), option_names(), "option")
-
-
-def check_shared_or_own(name: str, settings: Settings) -> None:
-    """Check that the configured estimator has an option.
-
-    Raises
-    ------
-    InputError
-        When it has not; the message names the estimator that has it.
-    """
-    if name not in Settings.SHARED:
-        check_option(name, type(settings.estimator))
 
 
 def _checked_indices(where: Sequence[int], n: int) -> list[int]:

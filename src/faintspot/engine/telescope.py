@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field, replace
-from typing import Any, Unpack
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +18,7 @@ from faintspot.base.errors import InputError
 from faintspot.base.files import Closing
 from faintspot.base.text_files import check_keys
 from faintspot.engine.pixel_ring import PixelRing
-from faintspot.engine.readout import CameraReport, Readout, RowTimes, StopEvent, readout_type
+from faintspot.engine.readout import CameraReport, Readout, readout_type
 from faintspot.engine.requests import EFFECT_TIMEOUT_S, Handler, changes_of
 from faintspot.engine.streams.bridge import CommandStream
 from faintspot.engine.streams.shared_streams import create_stream, held
@@ -174,7 +174,7 @@ class SimulatedTelescope(Readout, Closing):
         realisation: int = 0,
         say: Callable[[str], None] | None = None,
         keep_truth: Callable[[tuple[float, ...]], None] | None = None,
-        **rows: Unpack[RowTimes],
+        **rows: Any,
     ) -> None:
         self.configuration, self.name, self._say = configuration, name, say or (lambda _: None)
         self._keep_truth = keep_truth
@@ -192,7 +192,7 @@ class SimulatedTelescope(Readout, Closing):
                 dtype,
                 frame_rate_hz=configuration.control.frame_rate_hz,
                 spins=False,  # the simulation needs the processor
-                **RowTimes({"rows_per_block": layout.window[0], **rows}),
+                **{"rows_per_block": layout.window[0], **rows},
             )
             self._frames = create_stream(f"{name}_frames", layout.frame_shape, dtype)
             undo.callback(self._frames.unlink)
@@ -216,7 +216,7 @@ class SimulatedTelescope(Readout, Closing):
     def run(
         self,
         n_frames: int | None = None,
-        stop: StopEvent | None = None,
+        stop: threading.Event | None = None,
         progress: Callable[[int], None] | None = None,
     ) -> CameraReport:
         """Observe until `n_frames` are out or `stop` is set; a later call continues.

@@ -15,8 +15,6 @@ from faintspot.io.telemetry import left_out
 _BITS = 7  # 2^7 bins in every factor of 2: each is at most 1/128 of its value wide
 _LONGEST_NS = 2**37 - 1  # 137 s; longer durations count in the last bin
 _BINS = ((_LONGEST_NS.bit_length() - _BITS - 1) << _BITS) + 2 ** (_BITS + 1)
-RESOLUTION = 2.0 ** -(_BITS + 1)
-"""Largest relative error of a percentile."""
 
 
 class Latencies:
@@ -55,7 +53,7 @@ class Latencies:
         """Return the count, and mean, percentiles, smallest and largest [us]; None without durations.
 
         A percentile is the shortest duration that at least that part of all do not exceed, within a factor
-        1 +- `RESOLUTION` of the exact value.
+        1 +- 1/256 of the exact value.
         """
         counts = np.cumsum(np.array(self._counts, np.int64))  # a copy: all figures are of one moment
         count = int(counts[-1])

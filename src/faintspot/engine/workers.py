@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from faintspot.base.errors import InputError
 from faintspot.slopes.camera.calibration import Calibration
-from faintspot.slopes.estimators.registry import one_line
 from faintspot.slopes.kernels import streaming
 from faintspot.slopes.kernels.ordered import load, store
 from faintspot.slopes.pipeline.settings import Settings
@@ -116,8 +115,6 @@ class Workers:
         self._control = np.zeros(1, np.int64)
         self._completed = [False] * (1 + count)
         self._task: Task | None = None
-        self.fault: str | None = None
-        """Error of the last worker that died."""
         self._awake, self._closed = threading.Event(), False
         self._awake.set()
         self._threads = [self._started(number) for number in range(1, 1 + count)]
@@ -183,8 +180,7 @@ class Workers:
             task = self._task
             try:
                 self._completed[number] = task is not None and task(number)
-            except BaseException as error:
-                self.fault = one_line(error)
+            except BaseException:  # it is replaced
                 return
             done += 1
             store(cells, number * _LINE, done)

@@ -13,17 +13,17 @@ from rich.console import Console
 from tests.cli.cli_cases import Commands, command_line
 
 from faintspot.base.errors import InputError
-from faintspot.cli.realtime.telescope import _StrehlFile, in_words, methods_table
+from faintspot.cli.realtime.telescope import in_words, methods_table, write_strehl
 from faintspot.engine.page.demonstration import Shown
 from faintspot.engine.requests import ControlServer, request, socket_path
 from faintspot.engine.segment import FOLDER
 
 
 def test_times_are_those_of_the_middle_of_an_exposure(tmp_path: Path) -> None:
-    with _StrehlFile(str(tmp_path / "strehl.csv"), 10.0) as file:
+    with (tmp_path / "strehl.csv").open("w") as file:
         expected = time.time() + 5.0
-        file.write((7.0, 0.5, 200.0, 0.1, 3.0, time.monotonic(), 6.0, 50.0))
-    written = np.loadtxt(tmp_path / "strehl.csv", delimiter=",", skiprows=1)
+        write_strehl(file, 10.0, (7.0, 0.5, 200.0, 0.1, 3.0, time.monotonic(), 6.0, 50.0))
+    written = np.loadtxt(tmp_path / "strehl.csv", delimiter=",")
     assert written == pytest.approx([expected, 0.5, 10.0], abs=1.0)
     assert written[1:].tolist() == [0.5, 10.0]
 

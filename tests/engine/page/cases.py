@@ -5,15 +5,17 @@ from __future__ import annotations
 import asyncio
 import json
 import struct
+import threading
 from collections.abc import Awaitable, Callable, Mapping
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.engine.page.client_requests import Access, ClientRequest
+from faintspot.engine.page.client_requests import Access
 from faintspot.engine.page.page_state import Batch, BatchSource, Picture
 from faintspot.engine.page.server import LiveServer
+from faintspot.engine.requests import Handler
 from faintspot.engine.telemetry.ring import record_type
 from faintspot.slopes.sensor.layout import Layout
 
@@ -57,31 +59,17 @@ class Played:
     def state(self) -> dict[str, Any]:
         return {"kind": "engine", "name": self.name, "there": True}
 
-    def close(self) -> None:
-        pass
 
-
-class Noted:
+class Noted(dict[str, Handler]):
     """Notes what clients wish."""
 
     def __init__(self) -> None:
+        super().__init__(set=self._note)
         self.asked: list[dict[str, Any]] = []
 
-    def functions(self) -> Mapping[str, ClientRequest]:
-        def note(asked: dict[str, Any]) -> Mapping[str, Any]:
-            self.asked.append(asked)
-            return {"text": "noted"}
-
-        return {"set": note}
-
-
-class Stop:
-    """An event that is set from within."""
-
-    stopped = False
-
-    def is_set(self) -> bool:
-        return self.stopped
+    def _note(self, asked: dict[str, Any]) -> Mapping[str, Any]:
+        self.asked.append(asked)
+        return {"text": "noted"}
 
 
 def served(
@@ -93,14 +81,14 @@ def served(
 
     async def work() -> LiveServer:
         server = LiveServer(source or Played(), Noted(), Access(address), address)
-        stop = Stop()
+        stop = threading.Event()
         running = asyncio.get_running_loop().create_task(server.run(stop))
         try:
             await asyncio.wait_for(check(server), PATIENCE_S)
         finally:
             while _opened:
                 _opened.pop().close()
-            stop.stopped = True
+            stop.set()
             await running
             while _opened:
                 _opened.pop().close()

@@ -41,7 +41,7 @@ def asked() -> Iterator[list[tuple[str, dict[str, Any]]]]:
 
 
 def ask(client_requests: EngineRequests, **asked: Any) -> dict[str, Any]:
-    return answered(client_requests, asked)
+    return answered(client_requests.functions(), asked)
 
 
 def test_client_requests_reach_the_control_channel_as_the_command_line_sends_them(
@@ -82,7 +82,7 @@ def test_client_requests_reach_the_control_channel_as_the_command_line_sends_the
 def test_what_is_wrong_is_said_in_one_line(
     asked: list[tuple[str, dict[str, Any]]], tmp_path: Path, wish: dict[str, Any], error: str
 ) -> None:
-    answer = answered(EngineRequests(NAME, tmp_path), wish)
+    answer = answered(EngineRequests(NAME, tmp_path).functions(), wish)
     assert not answer["ok"]
     assert error in answer["error"]
     assert "\n" not in answer["error"]

@@ -77,7 +77,7 @@ def test_time_bar_speed_and_pause(night: Path, clock: Clock) -> None:
     source = RecordingSource(night)
 
     def ask(**asked: Any) -> None:
-        assert answered(source, {"do": "play", **asked})["ok"]
+        assert answered(source.functions(), {"do": "play", **asked})["ok"]
 
     def read() -> Any:
         return next_batch(source)
@@ -109,7 +109,7 @@ def test_time_bar_speed_and_pause(night: Path, clock: Clock) -> None:
 
 def test_changes_are_told_when_they_come(night: Path, clock: Clock) -> None:
     source = RecordingSource(night)
-    answered(source, {"do": "play", "position_s": 49.9})
+    answered(source.functions(), {"do": "play", "position_s": 49.9})
     batch = next_batch(source)
     assert batch.changes == []
     clock.now += 1.0
@@ -128,7 +128,7 @@ def test_changes_are_told_when_they_come(night: Path, clock: Clock) -> None:
     ],
 )
 def test_what_cannot_be_played(night: Path, asked: dict[str, Any], error: str) -> None:
-    answer = answered(RecordingSource(night), {"do": "play", **asked})
+    answer = answered(RecordingSource(night).functions(), {"do": "play", **asked})
     assert not answer["ok"]
     assert error in answer["error"]
 

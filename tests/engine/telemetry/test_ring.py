@@ -52,7 +52,7 @@ def test_what_is_written_is_read(name: str) -> None:
     ) as ring:
         reader = TelemetryRing.attach(name)
         assert reader.layout == LAYOUT
-        assert reader.settings == SETTINGS
+        assert reader.description["settings"] == SETTINGS
         assert reader.description["methods"] == ["none", "tv"]
         records, cursor, dropped = reader.records.since(0)
         assert (len(records), cursor, dropped) == (0, 0, 0)

@@ -7,7 +7,7 @@ import time
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, TextIO
 
 import click
 from rich.console import Console
@@ -106,8 +106,10 @@ def telescope(
     options["say"] = lambda line: say(f"{name}: {line}")
     with ExitStack() as files:
         if strehl is not None:
-            exposure_s = 1 / observed.control.frame_rate_hz
-            options["keep_truth"] = files.enter_context(_StrehlFile(strehl, exposure_s)).write
+            with output_errors(strehl):
+                stream = files.enter_context(open(strehl, "w", encoding="utf-8"))
+                stream.write("time_s,strehl,exposure_s\n")
+            options["keep_truth"] = partial(write_strehl, stream, 1 / observed.control.frame_rate_hz)
         simulated = files.enter_context(SimulatedTelescope(observed, name, **options))
         optics = simulated.telescope_model.optics
         rows, columns = optics.sensor.layout.frame_shape
@@ -122,33 +124,12 @@ def telescope(
     click.echo(f"{name}: {published(report)}")
 
 
-class _StrehlFile:
-    """CSV file with Unix time of the middle, true Strehl ratio and duration of each exposure.
-
-    Raises
-    ------
-    InputError
-        When it cannot be written.
-    """
-
-    def __init__(self, path: str, exposure_s: float) -> None:
-        self._path, self._exposure_s = path, exposure_s
-        with output_errors(path):
-            self._stream = open(path, "w", encoding="utf-8")  # noqa: SIM115
-            self._stream.write("time_s,strehl,exposure_s\n")
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._stream.close()
-
-    def write(self, truth: tuple[float, ...]) -> None:
-        """Write one exposure."""
-        _, strehl, *_, begun_s, _, _ = truth
-        time_s = begun_s + self._exposure_s / 2 + time.time() - time.monotonic()
-        with output_errors(self._path):
-            self._stream.write(f"{time_s:.4f},{strehl:.5f},{self._exposure_s:.6g}\n")
+def write_strehl(stream: TextIO, exposure_s: float, truth: tuple[float, ...]) -> None:
+    """Write Unix time of the middle, true Strehl ratio and duration of an exposure as a line of CSV."""
+    _, strehl, *_, begun_s, _, _ = truth
+    time_s = begun_s + exposure_s / 2 + time.time() - time.monotonic()
+    with output_errors(stream.name):
+        stream.write(f"{time_s:.4f},{strehl:.5f},{exposure_s:.6g}\n")
 
 
 @needs("realtime,loop", "pyshmem", "tornado", "zarr", "hcipy")

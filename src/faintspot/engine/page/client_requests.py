@@ -6,32 +6,22 @@ import re
 import secrets
 import socket
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from faintspot.base.errors import InputError
 from faintspot.base.tables import parse_changes, parse_ranges
-from faintspot.engine.requests import LENGTHY_TIMEOUT_S, request, since, socket_path
+from faintspot.engine.requests import LENGTHY_TIMEOUT_S, Handler, request, since, socket_path
 from faintspot.engine.telemetry.recorder import Recorder
 from faintspot.slopes.estimators.registry import one_line
 
-ClientRequest = Callable[[dict[str, Any]], Mapping[str, Any]]
 _FILE = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,90}\.zarr")
 _MOST_CHANGES = 100
 
 
-class ClientRequests(Protocol):
-    """Requests that a page may make, by name; a refused request raises InputError."""
-
-    def functions(self) -> Mapping[str, ClientRequest]:
-        """Return the functions of the requests, by name."""
-        ...
-
-
-def answered(client_requests: ClientRequests, request: dict[str, Any]) -> dict[str, Any]:
-    """Carry out a request; always return an answer."""
-    functions = client_requests.functions()
+def answered(functions: Mapping[str, Handler], request: dict[str, Any]) -> dict[str, Any]:
+    """Carry out a request with the function of its name; always return an answer."""
     try:
         wish = functions.get(request["do"])
         if wish is None:
@@ -56,7 +46,7 @@ class EngineRequests:
         self._name, self._path = name, socket_path(name)
         self.recording = RecordingThread(name, Path(folder))
 
-    def functions(self) -> Mapping[str, ClientRequest]:
+    def functions(self) -> Mapping[str, Handler]:
         """Return the functions of the requests, by name."""
         return {
             "set": self._set,

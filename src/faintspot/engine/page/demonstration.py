@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -17,7 +18,6 @@ from faintspot.base.files import Closing, derived, output_errors, write_atomical
 from faintspot.engine.child_processes import ONE_THREAD, ChildProcesses
 from faintspot.engine.control_loop import CLOSED, STATES
 from faintspot.engine.interleaving import short_names
-from faintspot.engine.readout import StopEvent
 from faintspot.engine.requests import LENGTHY_TIMEOUT_S, request, socket_path
 from faintspot.engine.streams.stream import Follower
 from faintspot.engine.telemetry.numbers import MethodDifference, compared_methods
@@ -128,7 +128,7 @@ class LiveDemonstration:
         save_control(path, gain=_GAIN, centroid_gain=1.0, model=model)
         return path, f"window+window_fwhm_px={width:g}+centroid_gain={gain:.3g}"
 
-    def run(self, stop: StopEvent, seconds: float, say: Say) -> Shown:
+    def run(self, stop: threading.Event, seconds: float, say: Say) -> Shown:
         """Start all processes, compare methods for `seconds` or until `stop` is set, and end the processes.
 
         The loop is closed with the integrator at once. A Kalman filter is learnt from its telemetry and
@@ -305,7 +305,7 @@ class _Watcher(Closing):
     """Reader of telemetry and truth as they arrive."""
 
     def __init__(
-        self, name: str, shown: Shown, looks_hz: float, processes: ChildProcesses, stop: StopEvent
+        self, name: str, shown: Shown, looks_hz: float, processes: ChildProcesses, stop: threading.Event
     ) -> None:
         self.shown, self._look_s = shown, max(1 / looks_hz, _LEAST_LOOK_S)
         self._processes, self._stop = processes, stop

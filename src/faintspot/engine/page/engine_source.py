@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from faintspot.base.checks import number_between
 from faintspot.base.errors import InputError
-from faintspot.engine.page.client_requests import ClientRequest
 from faintspot.engine.page.page_state import Batch, Floats, Picture
+from faintspot.engine.requests import Handler
 from faintspot.engine.streams.stream import Follower
 from faintspot.engine.telemetry.ring import TelemetryRing, image_type, record_type
 from faintspot.engine.telescope import TRUTH
@@ -195,12 +195,9 @@ class RecordingSource:
                 "settings": str(self._store.attributes.get("settings", "")),
             }
 
-    def close(self) -> None:
-        """Do nothing: no resources are held."""
-
     # Requests of clients -------------------------------------------------------------------------------
 
-    def functions(self) -> Mapping[str, ClientRequest]:
+    def functions(self) -> Mapping[str, Handler]:
         """Return the functions of the requests, by name."""
         return {"play": self._play}
 

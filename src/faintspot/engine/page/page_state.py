@@ -51,7 +51,6 @@ class Batch:
 class BatchSource(Protocol):
     """Interface of a source of batches."""
 
-    name: str
     layout: Layout | None
     """Layout of the sensor; None until it is known."""
     methods: list[str]
@@ -63,10 +62,6 @@ class BatchSource(Protocol):
 
     def state(self) -> dict[str, Any]:
         """Return the state of the source as plain values for the page."""
-        ...
-
-    def close(self) -> None:
-        """Release all resources."""
         ...
 
 

@@ -18,11 +18,11 @@ from pathlib import Path
 
 from faintspot.base.errors import InputError, MissingExtraError
 from faintspot.base.text_files import parse_json, to_json
-from faintspot.engine.page.client_requests import Access, ClientRequests, EngineRequests, answered
+from faintspot.engine.page.client_requests import Access, EngineRequests, answered
 from faintspot.engine.page.engine_source import EngineSource, RecordingSource
 from faintspot.engine.page.page import UPDATE_S, LatestMessages, Page, StatusPoller, packed
 from faintspot.engine.page.page_state import BatchSource
-from faintspot.engine.readout import StopEvent
+from faintspot.engine.requests import Handler
 
 try:
     from tornado.httpserver import HTTPServer
@@ -59,8 +59,8 @@ class LiveServer:
     Parameters
     ----------
     source : BatchSource
-    client_requests : ClientRequests
-        Requests that clients may make.
+    client_requests : mapping
+        Functions of the requests that clients may make, by name.
     access : Access
     address : str
     port : int
@@ -75,7 +75,7 @@ class LiveServer:
     def __init__(
         self,
         source: BatchSource,
-        client_requests: ClientRequests,
+        client_requests: Mapping[str, Handler],
         access: Access,
         address: str = "127.0.0.1",
         port: int = 0,
@@ -115,7 +115,7 @@ class LiveServer:
         host = f"[{self._address}]" if ":" in self._address else self._address
         return f"http://{host}:{self.port}/#{self.access.token}"
 
-    async def run(self, stop: StopEvent) -> None:
+    async def run(self, stop: threading.Event) -> None:
         """Update the page and serve it until the event is set."""
         try:
             while not stop.is_set():
@@ -328,7 +328,7 @@ async def _in_thread(work: Callable[[], dict[str, object]]) -> dict[str, object]
 
 def serve(
     shown: str | Path,
-    stop: StopEvent,
+    stop: threading.Event,
     ready: Callable[[LiveServer], None],
     *,
     address: str = "127.0.0.1",
@@ -366,11 +366,11 @@ def serve(
         access = Access(address, private)
         if isinstance(shown, Path):
             recording = RecordingSource(shown)
-            server = LiveServer(recording, recording, access, address, port)
+            server = LiveServer(recording, recording.functions(), access, address, port)
         else:
             source = used.enter_context(closing(EngineSource(shown)))
             requests = used.enter_context(closing(EngineRequests(shown, folder)))
-            server = LiveServer(source, requests, access, address, port)
+            server = LiveServer(source, requests.functions(), access, address, port)
 
             def send(kind: str, values: dict[str, object]) -> None:
                 recording = {"recording": requests.recording.status()} if kind == "status" else {}

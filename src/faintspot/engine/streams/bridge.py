@@ -9,6 +9,7 @@ While frames come, the bridge polls the stream's counter and notices a new frame
 import contextlib
 import math
 import os
+import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -19,7 +20,7 @@ from numpy.typing import NDArray
 from faintspot.base.checks import not_none, number_between
 from faintspot.base.errors import InputError
 from faintspot.engine.pixel_ring import PixelRing
-from faintspot.engine.readout import StopEvent, ring_type
+from faintspot.engine.readout import ring_type
 from faintspot.engine.streams.image_stream import ImageStreamWriter, Publication
 from faintspot.engine.streams.stream import Follower, Stream, StreamCounters, image_name
 
@@ -88,7 +89,7 @@ class StreamBridge(Follower):
         self._last_number = -1
         self._arrived, self._silent = -math.inf, True
 
-    def run(self, n_frames: int | None = None, stop: StopEvent | None = None) -> BridgeCounters:
+    def run(self, n_frames: int | None = None, stop: threading.Event | None = None) -> BridgeCounters:
         """Copy frames until `n_frames` have passed or `stop` is set.
 
         Raises
@@ -300,7 +301,7 @@ class StreamOut(Follower):
         self._target = name
         self._writer: ImageStreamWriter | None = None
 
-    def run(self, stop: StopEvent) -> None:
+    def run(self, stop: threading.Event) -> None:
         """Pass publications on until `stop` is set.
 
         Raises

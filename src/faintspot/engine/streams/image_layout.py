@@ -82,7 +82,7 @@ SEMAPHORES, TRACES = 10, 10
 MOST_POSTED = 10
 """Semaphore value up to which a publication posts."""
 TYPES = {1: "u1", 2: "i1", 3: "u2", 4: "i2", 5: "u4", 6: "i4", 7: "u8", 8: "i8", 9: "f4", 10: "f8", 13: "f2"}
-MATH_DATA = 2
+FLOAT32, MATH_DATA = 9, 2
 _CIRCULAR, _KINDS_OF_IMAGE, _CIRCULAR_IN_TIME = 0x1, 0xF, (0xF000F, 0x20001)
 _TRACE_BYTES, _CIRCULAR_FRAME_BYTES, _TIME_BYTES = 64, 48, 16
 _LARGEST_BYTES = 1 << 36

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import DTypeLike, NDArray
+from numpy.typing import NDArray
 
 from faintspot.base.errors import InputError
 from faintspot.engine.segment import identity_of, new_memory, process_start
@@ -189,8 +189,7 @@ class ImageStreamWriter:
     name : str
         See `path_of`.
     shape : (int,) or (int, int)
-        Shape of the values; a vector becomes an image of one row.
-    dtype : dtype
+        Shape of the values, float32; a vector becomes an image of one row.
 
     Raises
     ------
@@ -198,10 +197,10 @@ class ImageStreamWriter:
         When a living process made a stream of that name, the file is something else, or it cannot be made.
     """
 
-    def __init__(self, name: str, shape: tuple[int, ...], dtype: DTypeLike = np.float32) -> None:
+    def __init__(self, name: str, shape: tuple[int, ...]) -> None:
         self.path = layout.path_of(name)
         self.shape = (1, *shape) if len(shape) == 1 else shape
-        head = self._head(np.dtype(dtype))
+        head = self._head()
         _check_free(self.path)
         self._mapped = self._made(head, layout.places_of(head))
         self._identity = identity_of(self.path.stat())
@@ -253,17 +252,16 @@ class ImageStreamWriter:
                 f"{self.path}: this stream cannot be made: {places.total} bytes ({error.strerror})"
             ) from None
 
-    def _head(self, dtype: np.dtype[np.generic]) -> NDArray[np.generic]:
+    def _head(self) -> NDArray[np.generic]:
         """Return the metadata of a new stream."""
         head = np.zeros((), layout.METADATA)
-        code = next(code for code, each in layout.TYPES.items() if np.dtype(each) == dtype)
         head["naxis"], head["size"] = 2, (*self.shape[::-1], 0)
-        head["nelement"], head["datatype"] = math.prod(self.shape), code
+        head["nelement"], head["datatype"] = math.prod(self.shape), layout.FLOAT32
         head["shared"], head["sem"], head["NBkw"] = 1, layout.SEMAPHORES, 1
         head["name"] = self.path.name.removesuffix(".im.shm").encode()
         head["version"], head["imagetype"], head["location"] = layout.VERSION, layout.MATH_DATA, -1
         head["NBproctrace"], head["creatorPID"] = layout.TRACES, os.getpid()
-        head["imdatamemsize"] = math.prod(self.shape) * dtype.itemsize
+        head["imdatamemsize"] = 4 * math.prod(self.shape)
         head["creationtime"] = head["lastaccesstime"] = _clock()
         return head
 

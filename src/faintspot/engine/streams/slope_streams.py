@@ -169,15 +169,13 @@ class SlopeStreams:
 
     def commands_obstacle(self) -> str | None:
         """Return why the commands cannot be read by other programs, or None; for any thread."""
-        (name, (commands,)), stream = self._of_commands, self._commands
-        if not commands or self._closed:
+        name, (commands,) = self._of_commands
+        present = generation(name)
+        if not commands or self._closed or (self._commands is not None and present == self._generation):
             return None
-        try:
-            instance = pyshmem_module("publishing commands in shared memory").stat(name)["instance_id"]
-        except (OSError, ValueError):
+        if present is None:
             return f"{name} was removed"
-        same = stream is not None and instance == stream.instance_id
-        return None if same else f"{name} was recreated by another program; end that program"
+        return f"{name} was recreated by another program; end that program"
 
     def close(self) -> None:
         """Remove all streams."""

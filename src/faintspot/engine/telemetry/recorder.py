@@ -5,6 +5,7 @@ nothing.
 """
 
 import sys
+import threading
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -18,7 +19,6 @@ from faintspot.base.checks import number_between
 from faintspot.base.errors import InputError, load_package
 from faintspot.base.files import output_errors
 from faintspot.engine.interleaving import methods_after
-from faintspot.engine.readout import StopEvent
 from faintspot.engine.telemetry.ring import Ring, TelemetryRing
 from faintspot.io.telemetry import ARRAYS, CONTROL, FRAMES, IMAGES, stored_names
 from faintspot.io.zarr_store import TELEMETRY, checked_codecs, new_store, replace_attributes
@@ -209,7 +209,7 @@ class Recorder:
         *,
         n_frames: int | None = None,
         seconds: float | None = None,
-        stop: StopEvent | None = None,
+        stop: threading.Event | None = None,
         progress: Callable[[int], None] | None = None,
     ) -> RecordingReport:
         """Record until a limit is reached, `stop` is set or the engine ends.

@@ -130,8 +130,6 @@ class TelemetryRing(Segment):
         Records of all frames, images of some, and changes of settings; see `record_type` and `image_type`.
         Their cells count the items ever written.
     layout : Layout
-    settings : str
-        Initial settings of the engine: TOML text.
     """
 
     what, writer = "ring of telemetry", "engine"
@@ -144,7 +142,6 @@ class TelemetryRing(Segment):
             Ring(self.cells[row], items) for row, items in enumerate(self.rings.values(), CLOSED + 1)
         )
         self.layout = Layout(**self.description["layout"])
-        self.settings: str = self.description["settings"]
         items = self.records.items
         self._memory, self._written = items.view(np.uint8).data, 0
         self._slots, self._itemsize = len(items), items.itemsize
