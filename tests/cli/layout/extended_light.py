@@ -6,6 +6,7 @@ from typing import NamedTuple
 import numpy as np
 import scipy.ndimage
 from numpy.typing import NDArray
+from tests.slopes.sensor.sensor_cases import lattice, spot_frame
 
 Floats = NDArray[np.float64]
 
@@ -30,17 +31,15 @@ def gaussian(shape: tuple[int, int], x: float, y: float, std: float) -> Floats:
 @cache
 def flat_frame(reflection_e: float) -> Frame:
     """Return 221 spots of FWHM 4.7 px and 1000 ADU, without aberration, under one reflection."""
-    rng = np.random.default_rng(2)
     side = round(17 * PITCH_PX + 60)
     centre = (side - 1) / 2
-    shape = side, side
     row, column = np.mgrid[-8:9, -8:9].reshape(2, -1)
-    lit = np.hypot(row, column) <= 8.3
-    spots = centre + PITCH_PX * np.stack([column, row], axis=1)[lit]
-    electrons = sum(2000 / (2 * np.pi * 4) * gaussian(shape, x, y, 2.0) for x, y in spots)
-    electrons = electrons + reflection_e * gaussian(shape, centre + 8, centre - 6, 20.0)
-    adu = (rng.poisson(electrons + 10) + rng.normal(0, 3, shape)) / 2 + 20
-    return Frame(np.clip(np.round(adu), 0, 255).astype(np.uint8), spots)
+    spots = centre + PITCH_PX * np.stack([column, row], axis=1)[np.hypot(row, column) <= 8.3]
+    camera = {"background_e": 10.0, "gain_e_per_adu": 2.0, "offset_adu": 20.0}
+    frame = spot_frame(spots @ [1, 1j], (side, side), flux_e=2000.0, width_px=2.0, seed=2, **camera)
+    light = reflection_e * gaussian((side, side), centre + 8, centre - 6, 20.0)
+    adu = np.round(frame + np.random.default_rng(3).poisson(light) / 2)
+    return Frame(np.clip(adu, 0, 255).astype(np.uint8), spots)
 
 
 @cache
@@ -77,12 +76,6 @@ def eye_frame(seed: int, n: int = 15) -> Frame:
 @cache
 def mosaic_frames(gains: tuple[float, float, float, float]) -> NDArray[np.uint16]:
     """Return a frame of 9 x 9 spots of FWHM 3.5 px through filters of a Bayer mosaic."""
-    rng = np.random.default_rng(1)
-    shape, centre = (220, 220), 109.5
-    electrons = sum(
-        5000 / (2 * np.pi * 1.5**2) * gaussian(shape, centre + 20.3 * column, centre + 20.3 * row, 1.5)
-        for row in range(-4, 5)
-        for column in range(-4, 5)
-    )
+    frame = spot_frame(lattice((9, 9), 20.3, (28.3, 28.3)), (220, 220), flux_e=5000.0, width_px=1.5)
     mosaic = np.tile(np.reshape(gains, (2, 2)), (110, 110))
-    return (rng.poisson(electrons * mosaic + 5) + rng.normal(100, 2, shape)).round().astype(np.uint16)
+    return np.asarray(np.round(100 + (frame - 100) * mosaic), np.uint16)

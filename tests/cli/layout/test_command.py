@@ -32,7 +32,7 @@ def lattice(geometry: str) -> NDArray[np.float64]:
 
 def frames(geometry: str = "square", n_frames: int = 3) -> NDArray[np.float64]:
     """Frames with spots of 2000 e- at the lattice points, 3 e- of read noise, an offset of 100 ADU."""
-    nodes = np.asarray(lattice(geometry) @ [1, 1j], np.complex128)
+    nodes = lattice(geometry) @ [1, 1j]
     return np.stack([spot_frame(nodes, SHAPE, flux_e=2000.0, seed=seed) for seed in range(n_frames)])
 
 
@@ -313,7 +313,7 @@ def defocused(stretch: float = 1.02) -> NDArray[np.float64]:
     """Return a frame of 11 x 11 sub-apertures, 24 px apart, whose spots lie on a wider lattice."""
     row, column = np.indices((11, 11)).reshape(2, -1) - 5
     cells = (column + 1j * row)[np.hypot(row, column) <= 5.4]
-    nodes = np.asarray(159.5 * (1 + 1j) + stretch * 24 * cells, np.complex128)
+    nodes = 159.5 * (1 + 1j) + stretch * 24 * cells
     return spot_frame(nodes, (320, 320), flux_e=5000.0, width_px=np.sqrt(2), background_e=20.0)
 
 

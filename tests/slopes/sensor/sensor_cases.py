@@ -32,7 +32,7 @@ def lattice(shape: tuple[int, int], pitch_px: float, start: tuple[float, float])
 
 
 def spot_frame(
-    nodes: NDArray[np.complex128],
+    nodes: NDArray[Any],
     shape: tuple[int, int],
     *,
     flux_e: ArrayLike,
