@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from scipy.integrate import quad
 from tests.refusals import assert_each_refused
 
+from faintspot.slopes.estimators.centroid import centre_of_gravity
 from faintspot.slopes.simulate import spots
 
 # Closed forms are differences of numbers near 1: a few units of round-off.
@@ -25,13 +26,6 @@ def line(profile: str, width_px: float) -> Any:
         return lambda x: np.sinc(x / width_px) ** 2 / width_px
     sigma = width_px / np.sqrt(8 * np.log(2))
     return lambda x: np.exp(-0.5 * (x / sigma) ** 2) / (sigma * np.sqrt(2 * np.pi))
-
-
-def centre_of_gravity(images: NDArray[np.float64]) -> NDArray[np.float64]:
-    ny, nx = images.shape[-2:]
-    x, y = np.arange(nx) - (nx - 1) / 2, np.arange(ny) - (ny - 1) / 2
-    total = images.sum(axis=(1, 2))
-    return np.stack([(images.sum(axis=1) @ x) / total, (images.sum(axis=2) @ y) / total], axis=1)
 
 
 @pytest.mark.parametrize("profile", ["diffraction", "gaussian"])

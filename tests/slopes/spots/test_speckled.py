@@ -11,18 +11,10 @@ from numpy.typing import NDArray
 from scipy.integrate import quad
 from tests.refusals import assert_each_refused, refused
 
+from faintspot.slopes.estimators.centroid import centre_of_gravity
 from faintspot.slopes.simulate import Detector, speckled_spots, spots, subapertures
 from faintspot.slopes.spots import speckled
 from faintspot.slopes.spots.shapes import structure_function
-
-
-def centres_of_gravity(images: NDArray[np.float64]) -> NDArray[np.float64]:
-    ny, nx = images.shape[1:]
-    y, x = np.indices((ny, nx)) - np.array([(ny - 1) / 2, (nx - 1) / 2])[:, None, None]
-    total = images.sum(axis=(1, 2))
-    sums = np.stack([(images * x).sum(axis=(1, 2)), (images * y).sum(axis=(1, 2))], axis=1)
-    centres: NDArray[np.float64] = sums / total[:, None]
-    return centres
 
 
 def kolmogorov(r: Any) -> Any:
@@ -124,18 +116,9 @@ def test_truth_is_the_centre_of_gravity_of_all_the_flux() -> None:
         60, d_over_r0=2.0, shape=(60, 56), position_range_px=2.0, rng=np.random.default_rng(6)
     )
     # Light outside 28 lambda / d (2 %) pulls by a few hundredths of a pixel; positions have a rms above 1.
-    error = centres_of_gravity(images) - truth
+    error = centre_of_gravity(images) - truth
     assert np.sqrt(np.mean(error**2)) < 0.06
     assert truth.std() > 1.0
-
-
-def test_positions_are_what_was_asked_for() -> None:
-    given = np.array([[0.5, -3.0], [2.0, 1.0]])
-    _, truth = speckled_spots(2, d_over_r0=4.0, positions=given)
-    np.testing.assert_array_equal(truth, given)
-    _, truth = speckled_spots(500, d_over_r0=4.0, position_range_px=0.5)
-    assert np.max(np.abs(truth)) <= 0.5
-    assert truth.std() == pytest.approx(0.5 / np.sqrt(3), rel=0.1)  # 1000 values: 3 standard errors
 
 
 def test_an_immense_outer_scale_is_kolmogorov_s() -> None:

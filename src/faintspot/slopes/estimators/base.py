@@ -75,9 +75,9 @@ class Estimator(Options):
     """Method that finds the position of the spot in a sub-aperture image.
 
     A subclass is a frozen dataclass (`@dataclass(frozen=True, eq=False, kw_only=True)`) whose fields are
-    its options, declared by `base.config.options.option`. It overrides `locate` (NumPy) or `plan`
+    its options, declared by `faintspot.slopes.estimators.option`. It overrides `locate` (NumPy) or `plan`
     (compiled kernel). Register it by name with `faintspot.slopes.estimators.register`, or, in an installed
-    package, with the entry point group `faintspot.slopes.estimators`.
+    package, with the entry point group `faintspot.estimators`.
 
     Examples
     --------

@@ -192,16 +192,16 @@ def learn_psf_from_images(
         if numbers.shape != (n,):
             raise InputError(f"index: expected one number for each of {n} images, got shape {numbers.shape}")
     shape = (stack.images.shape[1], stack.images.shape[2])
-    checked = _within(checked_options(shape, **options), search_range_px)
+    checked = replace(checked_options(shape, **options), search_px=_search_px(shape, search_range_px))
     return _learn(stack, numbers, start, checked, rng, progress)
 
 
-def _within(options: LearningOptions, search_range_px: float | None) -> LearningOptions:
+def _search_px(window: tuple[int, int], search_range_px: float | None) -> float:
     """Return the largest distance from the image's centre at which spots are looked for."""
+    half = min(window) / 2
     if search_range_px is None:
-        return options
-    search = number_between("search_range_px", search_range_px, 0.0, low_open=True)
-    return replace(options, search_px=min(search, options.search_px))
+        return half
+    return min(number_between("search_range_px", search_range_px, 0.0, low_open=True), half)
 
 
 def fit_spots(
@@ -229,13 +229,12 @@ def fit_spots(
     stack = image_stack(images, Calibration() if calibration is None else calibration)
     n, shape = len(stack.images), (stack.images.shape[1], stack.images.shape[2])
     single = PSF(psf.samples[:1], psf.oversampling)
-    options = _within(
-        LearningOptions(max(shape) // 2 + 1, psf.oversampling, 0, min(shape) / 2), search_range_px
-    )
+    search_px = _search_px(shape, search_range_px)
+    options = LearningOptions(max(shape) // 2 + 1, psf.oversampling, _BACKGROUND_ROUNDS, search_px)
     border = np.ones(shape, dtype=bool)
     border[1:-1, 1:-1] = False
     learning, wings = Learning(stack, np.zeros(n, np.int64), single, options), np.zeros((n, *shape))
-    for _ in range(_BACKGROUND_ROUNDS):
+    for _ in range(options.rounds):
         learning.background_e[0] = np.median(np.mean((stack.images - wings)[:, border], axis=1))
         spots, _ = learning.register()
         wings = single.images(spots.positions, shape, spots.flux_e)
