@@ -338,3 +338,18 @@ class Detector(Options):
             return adu.astype(np.float32)
         counts = np.clip(np.rint(adu), 0, 2**self.bits - 1)
         return counts.astype(np.uint16) if self.bits <= 16 else counts.astype(np.uint32)
+
+
+def detector_or_default(detector: object) -> Detector:
+    """Return the detector; the default has 0.1 e- read noise and no other noise.
+
+    Raises
+    ------
+    InputError
+        If it is something else.
+    """
+    if detector is None:
+        return Detector(read_noise_e=0.1)
+    if not isinstance(detector, Detector):
+        raise InputError(f"detector: expected a Detector or None, got {type(detector).__name__}")
+    return detector

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from faintspot.base.checks import number_between, spawn
 from faintspot.base.errors import InputError
-from faintspot.slopes.camera.detector import Detector
+from faintspot.slopes.camera.detector import Detector, detector_or_default
 from faintspot.slopes.sensor.layout import Layout
 from faintspot.slopes.spots.psf import PSF
 from faintspot.slopes.spots.shapes import SpotShape, image_shape, per_spot, spots
@@ -92,7 +92,7 @@ def subapertures(
     # Spawned only if needed, so that without turbulence later draws of the generator do not change.
     phase_rng = spawn(rng, 1)[0] if turbulence else None
     truth = true_positions(positions, position_range_px, (n, 2), position_rng)
-    camera = _camera(detector)
+    camera = detector_or_default(detector)
     profile, spot = _values_of_spots(n, (ny, nx), flux_e, **spot_shape)
     if turbulence and (profile != "diffraction" or np.any(spot["elongation"] != 1)):
         raise InputError(f"d_over_r0 = {turbulence:g}: expected profile 'diffraction' and elongation 1")
@@ -186,7 +186,7 @@ def sensor_frames(
     jitter = number_between("jitter_px", jitter_px, 0.0)
     if jitter:  # spawned only if needed, as above
         truth += spawn(rng, 1)[0].normal(0.0, jitter, (n_frames, 1, 2))
-    camera = _camera(detector)
+    camera = detector_or_default(detector)
     if psf and spot_shape:
         raise InputError(f"psf: expected no {', '.join(spot_shape)} beside it")
     sensor = n, layout.window, flux_e
@@ -239,15 +239,6 @@ def _values_of_spots(
     one_of_each = dict(zip(values, kinds.T, strict=True))
     centred = spots(np.zeros((len(kinds), 2)), shape=shape, profile=profile, **one_of_each)
     return profile, {**values, "flux_e": flux / centred.sum(axis=(1, 2))[which]}
-
-
-def _camera(detector: object) -> Detector:
-    """Return the detector; the default has 0.1 e- read noise and no other noise."""
-    if detector is None:
-        return Detector(read_noise_e=0.1)
-    if not isinstance(detector, Detector):
-        raise InputError(f"detector: expected a Detector or None, got {type(detector).__name__}")
-    return detector
 
 
 def _window_pixels(layout: Layout) -> NDArray[np.int64]:

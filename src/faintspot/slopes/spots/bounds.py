@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from faintspot.base.checks import number_between, numbers_between, one_of
 from faintspot.base.errors import InputError
-from faintspot.slopes.camera.detector import Detector
+from faintspot.slopes.camera.detector import Detector, detector_or_default
 from faintspot.slopes.spots.fixed_weights import STEP_PX, images_with_derivatives
 from faintspot.slopes.spots.psf import PSF
 from faintspot.slopes.spots.shapes import SpotShape, image_shape, per_spot, position_array, spots
@@ -340,15 +340,12 @@ def _with_derivatives(render: Any, positions: Floats, step: float) -> _Spot:
 
 def _noise(detector: object, shape: tuple[int, int], exact: bool) -> _PixelNoise:
     """Return the noise of each pixel in photo-electrons, flattened."""
-    if detector is None:
-        detector = Detector(read_noise_e=0.1)
-    if not isinstance(detector, Detector):
-        raise InputError(f"detector: expected a Detector or None, got {type(detector).__name__}")
-    excess = detector.excess_noise_factor
+    camera = detector_or_default(detector)
+    excess = camera.excess_noise_factor
     # Take the background electrons from the variance that the detector itself reports.
-    dark = detector.variance(np.zeros(shape))
-    converter = detector.gain_e_per_adu**2 / 12 if detector.bits is not None else 0.0
-    read_variance = (np.square(detector.read_noise_e) + converter) / detector.em_gain**2
+    dark = camera.variance(np.zeros(shape))
+    converter = camera.gain_e_per_adu**2 / 12 if camera.bits is not None else 0.0
+    read_variance = (np.square(camera.read_noise_e) + converter) / camera.em_gain**2
     background = np.maximum(dark - read_variance, 0.0) / excess
     read_noise = np.broadcast_to(np.sqrt(read_variance), shape)
     return _PixelNoise(read_noise.ravel(), background.ravel(), excess, exact and excess == 1)
