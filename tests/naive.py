@@ -289,8 +289,8 @@ class Light:
 def light(
     frame: ArrayLike,
     layout: fs.Layout,
-    calibration: fs.Calibration | None,
-    fwhm: float | None,
+    calibration: fs.Calibration,
+    fwhm: float,
     flux: ArrayLike,
     measured: ArrayLike,
 ) -> Light:
@@ -303,7 +303,7 @@ def light(
     typical = bright[len(sampled) // 16 :][:3]
     if box == 0 or not typical:
         return Light(none, none)
-    electrons = calibrate(frame, fs.Calibration() if calibration is None else calibration)
+    electrons = calibrate(frame, calibration)
     windows = np.stack([electrons[y : y + ny, x : x + nx] for y, x in layout.corners])
     several = [(2 * i + 1) * n // (2 * min(n, 16)) for i in range(min(n, 16))]
     several = [s for s in several if np.asarray(measured)[s]]
@@ -323,12 +323,11 @@ def light(
     return Light(suspect & many & (peaks < limit), suspect & (near | (np.abs(peaks / limit - 1) < 0.01)))
 
 
-def box_of(window: tuple[int, int], fwhm: float | None) -> int:
+def box_of(window: tuple[int, int], fwhm: float) -> int:
     """The odd side of a box that holds most of a spot and fits twice into the window."""
     if min(window) < 4:
         return 0
-    wanted = 3.0 if fwhm is None else max(1.25 * fwhm, 3.0)
-    return min(range(1, min(window) // 2 + 1, 2), key=lambda side: abs(side - wanted))
+    return min(range(1, min(window) // 2 + 1, 2), key=lambda side: abs(side - max(1.25 * fwhm, 3.0)))
 
 
 def peak_in_box(window: Floats, box: int) -> float:

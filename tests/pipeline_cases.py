@@ -140,7 +140,7 @@ def assert_equals_oracle(case: Case, slopes: fs.Slopes) -> None:
     light = naive.light(*known, slopes.flux, measured)
     for s in np.flatnonzero(light.dark).tolist():
         found[s].x, found[s].y, found[s].flags = 0.0, 0.0, found[s].flags | Flag.NO_FLUX
-    doubtful = naive.doubtful(slopes, case.layout, fwhm, 0.0 if case.reference is None else case.reference)
+    doubtful = naive.doubtful(slopes, case.layout, fwhm, case.reference)
     assert np.array_equal(slopes.flags & (Flag.AT_SEARCH_LIMIT | Flag.UNLIKE_NEIGHBOURS), doubtful)
     flags = slopes.flags & ~np.uint8(Flag.AT_SEARCH_LIMIT | Flag.UNLIKE_NEIGHBOURS)
     for s, (expected, scale) in enumerate(zip(found, largest_value(case), strict=True)):
