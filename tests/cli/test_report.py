@@ -33,32 +33,28 @@ def test_one_and_two_methods(measured: Path, run: Commands) -> None:
     run.ok("report", "slopes.zarr", "plain.npz", "-o", "both.html")
     assert is_page(measured / "both.html")
     assert "plain.npz" in (measured / "both.html").read_text(encoding="utf-8")
-
-
-@pytest.mark.slow
-def test_frames_that_have_moved(measured: Path, run: Commands) -> None:
     (measured / "a.npy").rename(measured / "b.npy")
     run.ok("report", "slopes.zarr", "-o", "with.html", "--recording", "b.npy")
     assert is_page(measured / "with.html")
-    run.refused("report", "slopes.zarr", "--recording", "nix.npy", naming=("nix.npy",))
 
 
-def test_stores_that_hold_no_slopes_are_refused(measured: Path, run: Commands) -> None:
-    run.refused("report", "nix.zarr", naming=("nix.zarr", "no such file"))
-    run.refused("report", "a.npy", naming=("a.npy",))
-    run.refused("report", ".", naming=(".: ", "Zarr store of slopes"))
-    run.refused("report", "slopes.zarr", "plain.npz", "plain.npz", naming=("one file or two", "3"))
+def test_what_cannot_be_reported(measured: Path, run: Commands) -> None:
     (measured / "text.npz").write_text("nothing")
-    run.refused("report", "text.npz", naming=("text.npz", "slopes"))
     np.savez("frames.npz", frames=simulated())
-    run.refused("report", "frames.npz", naming=("frames.npz", "slopes"))
     (measured / "empty.zarr").mkdir()
-    run.refused("report", "empty.zarr", naming=("empty.zarr",))
-    assert not list(measured.glob("*.html"))
-
-
-def test_pages_in_place_of_other_files_are_refused(measured: Path, run: Commands) -> None:
-    run.refused("report", "slopes.zarr", "-o", "nix/page.html", naming=("nix/page.html", "does not exist"))
     before = (measured / "plain.npz").read_bytes()
-    run.refused("report", "plain.npz", "-o", "plain.npz", naming=("plain.npz", "page"))
+    for arguments, naming in {
+        "nix.zarr": ("nix.zarr", "no such file"),
+        "a.npy": ("a.npy",),
+        ".": (".: ", "Zarr store of slopes"),
+        "slopes.zarr plain.npz plain.npz": ("one file or two", "3"),
+        "text.npz": ("text.npz", "slopes"),
+        "frames.npz": ("frames.npz", "slopes"),
+        "empty.zarr": ("empty.zarr",),
+        "slopes.zarr --recording nix.npy": ("nix.npy",),
+        "slopes.zarr -o nix/page.html": ("nix/page.html", "does not exist"),
+        "plain.npz -o plain.npz": ("plain.npz", "page"),
+    }.items():
+        run.refused("report", *arguments.split(), naming=naming)
+    assert not list(measured.glob("*.html"))
     assert (measured / "plain.npz").read_bytes() == before
