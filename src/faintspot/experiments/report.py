@@ -84,7 +84,7 @@ def estimator_figures(dataset: xarray.Dataset) -> Iterator[FigureWithData]:
         ]
         yield _figure("estimators", group, rows)
     for group in _groups(dataset, "d_over_r0", ("read_noise_e", "flux_e"), speckled=True):
-        speckled = dataset.sel(mode=_corrected_mode(dataset))
+        speckled = dataset.sel(mode=CORRECTED if CORRECTED in names_of(dataset, "mode") else BEST)
         panels = [
             _panel(speckled.isel(cell=cells), "corrected_rms", "d_over_r0", title)
             for title, cells in group.panels.items()
@@ -130,11 +130,6 @@ def _panel(cells: xarray.Dataset, kind: str, axis: str, title: str) -> Panel:
         lines.append(Line("best", x, best, style={**_BEST_OF_CELL, "zorder": 4}, in_legend=False))
         scale["y_range"] = (0.85 * best.min(), min(4.0, 1.2 * float(np.nanmax(values))))
     return Panel(lines, y=_TEXT[f"estimator_axes.{kind}"], title=title, **scale)
-
-
-def _corrected_mode(dataset: xarray.Dataset) -> str:
-    """Return the mode whose settings are chosen for the gain-corrected rms, where the study has it."""
-    return CORRECTED if CORRECTED in names_of(dataset, "mode") else BEST
 
 
 _TEXT = Texts("faintspot.experiments")

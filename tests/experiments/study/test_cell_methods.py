@@ -77,13 +77,10 @@ def test_every_k_is_the_definition(seed: int, side: int, levels: int, offset: fl
         np.testing.assert_allclose(positions[clear, k - 1], expected[clear], rtol=0, atol=1e-8)
 
 
-def test_flat_and_extreme_images() -> None:
+def test_tiny_images() -> None:
     tiny = np.zeros((1, 4, 4), np.float32)
+    assert not position_table(BrightestPixels(), tiny)[1].any()
     tiny[0, 1, 2] = 1e-30
-    for image in (np.zeros((1, 4, 4), np.float32), np.full((1, 4, 4), 7.1, np.float32)):
-        positions, valid = position_table(BrightestPixels(), image)
-        assert not valid.any()
-        assert not positions.any()
     positions, valid = position_table(BrightestPixels(), tiny)
     assert valid.all()
     np.testing.assert_allclose(positions[0], np.broadcast_to([0.5, -0.5], (15, 2)))
@@ -91,9 +88,10 @@ def test_flat_and_extreme_images() -> None:
 
 def test_without_flux_the_position_is_the_centre() -> None:
     flat = np.full((1, 10, 10), 0.1, np.float32)
-    positions, valid = position_table(TotalVariation(noise_std=1.4), flat)
-    assert not valid.any()
-    assert not positions.any()
+    for estimator in (BrightestPixels(), TotalVariation(noise_std=1.4)):
+        positions, valid = position_table(estimator, flat)
+        assert not valid.any()
+        assert not positions.any()
     specification = StudySpecification("s", [Sweep("a", pixels=10)], estimators=["thresholded"])
     methods = CellMethods(specification.cells()[0], specification)
     slopes = methods.measure("thresholded", (("threshold_e", 5.0),), flat)

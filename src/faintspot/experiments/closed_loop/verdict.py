@@ -216,9 +216,13 @@ def loop_page(result: MagnitudeResult) -> page.Report:
     configuration = LoopConfiguration.of_results(result.configuration)
     wavelength_um = 1.65 if configuration is None else configuration.science.wavelength_m * 1e6
     name = "" if configuration is None else f": “{configuration.name}”"
+    references = reference_methods(result)
+    figure = magnitude_figure(result, references[0], f"Strehl ratio at {wavelength_um:.3g} µm")
+    base = " and then with ".join(result.labels[method] for method in references)
     sections = [
         _TEXT.section("verdict", *loop_verdict(result)),
-        *_of_magnitudes(result, f"Strehl ratio at {wavelength_um:.3g} µm"),
+        _TEXT.section("magnitude", strehl_table(result), figure, shape=result.strehl.shape, reference=base),
+        _TEXT.section("settings", settings_table(result)),
         page.configuration_section(result.configuration),
     ]
     facts = {} if configuration is None else _facts(configuration)
@@ -235,17 +239,6 @@ def loop_warnings(result: MagnitudeResult) -> list[str]:
         few=count if count < _FEW_REALISATIONS else None,
         fewest=_FEW_REALISATIONS,
     )
-
-
-def _of_magnitudes(result: MagnitudeResult, strehl: str) -> list[page.Section]:
-    """Return the sections of Strehl against magnitude; `strehl` is the label of an axis."""
-    references = reference_methods(result)
-    figure = magnitude_figure(result, references[0], strehl)
-    base = " and then with ".join(result.labels[method] for method in references)
-    return [
-        _TEXT.section("magnitude", strehl_table(result), figure, shape=result.strehl.shape, reference=base),
-        _TEXT.section("settings", settings_table(result)),
-    ]
 
 
 def magnitude_figure(result: MagnitudeResult, reference: int, label: str) -> page.FigureWithData:

@@ -37,6 +37,8 @@ from faintspot.experiments.night.protocol import COUNTS, Night
 from faintspot.loop.simulation.configuration import LoopConfiguration
 
 Floats = NDArray[np.float64]
+Shown = dict[str, tuple[NDArray[np.bool_], dict[str, object]]]
+"""Blocks and style of what is drawn, by name."""
 
 _TEXT = Texts("faintspot.experiments.night")
 _REFERENCE_STYLE: dict[str, object] = {"color": "#000000", "marker": "o"}
@@ -66,14 +68,14 @@ def panels_figure(night: Night) -> page.FigureWithData:
     values: dict[str, Any] = {
         "seconds": float(np.median(night.duration_s)),
         "reference": night.labels[night.reference],
+        "strengths": night.has_strengths,
     }
-    values["strengths"] = night.has_strengths
     options: dict[str, Any] = {"width": 0.72 * WIDTH, "columns": 3, "legend": "outside upper center"}
     rows = [[panel] for panel in panels]
     return _TEXT.figure("panels", rows, 4.1 * len(panels), values, **options)
 
 
-def _shown(night: Night) -> dict[str, tuple[NDArray[np.bool_], dict[str, object]]]:
+def _shown(night: Night) -> Shown:
     """Return blocks and style of what is drawn, by name; each block once, the reference last."""
     every = groups(night)
     others = [name for name in every if name not in _TV_STYLES]
@@ -88,12 +90,7 @@ def _shown(night: Night) -> dict[str, tuple[NDArray[np.bool_], dict[str, object]
     return shown | {night.labels[night.reference]: (night.is_reference, _REFERENCE_STYLE)}
 
 
-def _points(
-    night: Night,
-    shown: dict[str, tuple[NDArray[np.bool_], dict[str, object]]],
-    x: Floats,
-    x_error: Floats | None = None,
-) -> list[Line]:
+def _points(night: Night, shown: Shown, x: Floats, x_error: Floats | None = None) -> list[Line]:
     return [
         Line(
             name,
@@ -140,9 +137,7 @@ def _regressions(night: Night) -> list[Line]:
     ]
 
 
-def _of_strengths(
-    night: Night, shown: dict[str, tuple[NDArray[np.bool_], dict[str, object]]], bottom: dict[str, Any]
-) -> Panel:
+def _of_strengths(night: Night, shown: Shown, bottom: dict[str, Any]) -> Panel:
     """Return blocks against strength, and the ranges at the height of the reference plus their difference."""
     reference = night.strehl[night.is_reference]
     mean, scatter = float(np.nanmean(reference)), float(np.nanstd(reference))

@@ -182,7 +182,10 @@ def _night(
     begin_s = float(loop.time_s[turns[0].scored])
     columns = []
     for parts in _groups(kept, methods.reference, together):
-        r0 = _r0(loop, [scored.turn for part in parts for scored in part], gains)
+        # Of all methods' turns together, so that no method passes for better seeing.
+        turns_of_group = [scored.turn for part in parts for scored in part]
+        atmosphere, residual, run = open_loop_slopes(loop, turns_of_group, gains.tolist())
+        r0 = r0_of_slopes(atmosphere, residual, loop.site, loop.outer_scale_m, run=run)
         columns += [
             _column(loop, part, r0, relative, wavelength_m, begin_s, strehl is not None) for part in parts
         ]
@@ -314,12 +317,6 @@ def _column(
         return {**values, "strehl": mean, "strehl_error": spread, "shared_error": 0.0}
     ratio = math.exp(-phase) if math.isfinite(phase) else math.nan
     return {**values, "strehl": ratio, "strehl_error": ratio * wave * error, "shared_error": ratio * of_gain}
-
-
-def _r0(loop: AlternatingLoop, turns: Sequence[Turn], gains: Floats) -> tuple[float, float]:
-    """Return r0 of all methods' turns together, so that no method passes for better seeing, and its error."""
-    atmosphere, residual, run = open_loop_slopes(loop, turns, gains.tolist())
-    return r0_of_slopes(atmosphere, residual, loop.site, loop.outer_scale_m, run=run)
 
 
 _TEXT = Texts("faintspot.experiments.night")

@@ -272,10 +272,9 @@ def _slope_with_noise(gains: list[tuple[StudyConditions, Gain]]) -> tuple[float,
     """Return the weighted least-squares slope of ln(gain) on log10(read noise), with its standard error."""
     x = np.log10([key.read_noise_e for key, _ in gains])
     y = np.log([gain.factor for _, gain in gains])
-    weight = np.array([gain.log_se for _, gain in gains]) ** -2.0
-    centred = x - np.average(x, weights=weight)
-    scatter = float(np.sum(weight * centred**2))
-    return float(np.sum(weight * centred * y) / scatter), float(scatter**-0.5)
+    weights = 1 / np.array([gain.log_se for _, gain in gains])
+    line, covariance = np.polyfit(x, y, 1, w=weights, cov="unscaled")
+    return float(line[0]), math.sqrt(covariance[0, 0])
 
 
 def _level_gains(

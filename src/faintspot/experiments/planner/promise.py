@@ -14,7 +14,6 @@ from faintspot.experiments.planner.question import Question
 from faintspot.loop.simulation.methods import Method
 from faintspot.slopes.camera.calibration import Calibration
 from faintspot.slopes.pipeline.slope_pipeline import SlopePipeline
-from faintspot.slopes.pipeline.slopes import Slopes
 from faintspot.slopes.sensor.layout import Layout
 from faintspot.slopes.spots.psf import PSF
 from faintspot.slopes.training.psf_learning import LearntPSF, fit_spots
@@ -306,10 +305,7 @@ def _measure(question: Question, method: Method, images: Floats) -> Floats:
     pipeline = SlopePipeline(
         windows, method.settings, camera, reference=not_none(question.layout).offsets, **method.parts
     )
-    return _positions(pipeline(images.reshape(n_frames, n * ny, nx).astype(np.float32)))
-
-
-def _positions(slopes: Slopes) -> Floats:
+    slopes = pipeline(images.reshape(n_frames, n * ny, nx).astype(np.float32))
     return np.stack([slopes.x, slopes.y], axis=-1).astype(np.float64)
 
 

@@ -181,7 +181,9 @@ class _Trial:
                         raise
                     self._left_out[name] = f"it refuses {flux:.3g} electrons per spot: {error}"
                     del self._kinds[name]
-                self._advance(1)
+                self._finished += 1
+                if self.progress is not None:
+                    self.progress(self._finished, self._to_do)
 
     def _tried(self, kind: type[Estimator], flux_e: float, samples: Sequence[SpotFrames]) -> _Scored:
         """Choose an estimator's options on the first sample, and score it on the second."""
@@ -207,11 +209,6 @@ class _Trial:
         """The user's PSF, or that of the assumed profile."""
         spots = self.question.spots
         return spots.known_psf(math.ceil(max(spots.shape) / 2 + spots.search_range_px + 1))
-
-    def _advance(self, count: int) -> None:
-        self._finished += count
-        if self.progress is not None:
-            self.progress(self._finished, self._to_do)
 
     def answer(self, rng: np.random.Generator) -> Answer:
         """Return what the fluxes tried so far say."""

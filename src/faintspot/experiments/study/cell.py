@@ -169,8 +169,7 @@ class Scores:
     def __init__(self, methods: CellMethods, choices: dict[tuple[str, str], Chosen]) -> None:
         self.methods, self.choices = methods, choices
         self._truth: list[Floats] = []
-        self._positions: dict[tuple[str, str], list[Floats]] = {key: [] for key in choices}
-        self._valid: dict[tuple[str, str], list[Any]] = {key: [] for key in choices}
+        self._measured: dict[tuple[str, str], list[tuple[Floats, Any]]] = {key: [] for key in choices}
         self._stated: dict[str, list[Floats]] = {}
         self.sums: dict[str, Any] = {}  # of the errors and of their squares, for every k
 
@@ -194,8 +193,7 @@ class Scores:
         positions, valid, stated = measured
         for mode in modes:
             column = self.choices[method, mode][1] or 0
-            self._positions[method, mode].append(positions[:, column])
-            self._valid[method, mode].append(valid[:, column])
+            self._measured[method, mode].append((positions[:, column], valid[:, column]))
         if BEST not in modes:
             return
         if stated is None:
@@ -207,11 +205,11 @@ class Scores:
 
     def positions(self, method: str, mode: str) -> Floats:
         """Return the positions of all realisations, (n, 2) px."""
-        return np.concatenate(self._positions[method, mode])
+        return np.concatenate([positions for positions, _ in self._measured[method, mode]])
 
     def valid(self, method: str, mode: str) -> NDArray[np.bool_]:
         """Return which realisations have a valid position."""
-        return np.concatenate(self._valid[method, mode])
+        return np.concatenate([valid for _, valid in self._measured[method, mode]])
 
     def stated(self, method: str) -> Floats | None:
         """Return the standard errors (n, 2) that an estimator states, px, in mode "best"."""
