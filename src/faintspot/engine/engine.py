@@ -8,7 +8,7 @@ from collections import Counter
 from collections.abc import Callable
 from contextlib import ExitStack
 from itertools import count
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -20,7 +20,6 @@ from faintspot.engine.frame_path import FramePath
 from faintspot.engine.interleaving import Interleaving
 from faintspot.engine.pixel_ring import PixelRing, living_ring
 from faintspot.engine.running_settings import Change, RunningSettings
-from faintspot.engine.streams.bridge import StreamBridge
 from faintspot.engine.streams.slope_streams import PredictionStream, SlopeStreams
 from faintspot.engine.telemetry.ring import TelemetryRing
 from faintspot.engine.timing import INCOMPLETE, WORKER, FrameAccount
@@ -30,6 +29,9 @@ from faintspot.loop.control.options import NONE, STREAM
 from faintspot.slopes.pipeline.configuration import to_text
 from faintspot.slopes.pipeline.settings import Settings
 from faintspot.slopes.pipeline.slope_pipeline import SlopePipeline
+
+if TYPE_CHECKING:
+    from faintspot.engine.streams.bridge import StreamBridge
 
 _WATCH_S = 0.02  # between two checks of the watcher
 _LOOKS_BETWEEN_SLOW = 10  # ditto, between two of those that take longer

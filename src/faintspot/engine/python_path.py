@@ -23,7 +23,6 @@ from faintspot.slopes.kernels.groups import CALIBRATED
 from faintspot.slopes.kernels.products import ProductPart
 from faintspot.slopes.pipeline.settings import Settings
 from faintspot.slopes.pipeline.slope_pipeline import SlopePipeline
-from faintspot.slopes.simulate import Detector, sensor_frames
 
 Result = TypeVar("Result")
 _TRIAL = "faintspot-trial"
@@ -106,6 +105,8 @@ def trial_frames(pipeline: SlopePipeline) -> list[NDArray[np.float32]]:
 
 def typical_frame(pipeline: SlopePipeline) -> NDArray[np.float32]:
     """Return a frame (h, w) in ADU with a spot in every sub-aperture and read noise; the same each time."""
+    from faintspot.slopes.simulate import Detector, sensor_frames  # estimators in NumPy alone are tried
+
     electrons, _ = sensor_frames(
         pipeline.layout,
         1,
