@@ -56,8 +56,8 @@ class LightTest(NamedTuple):
     """(2, h, w) float32: dark in ADU, and electrons per ADU (NaN in bad pixels), of each pixel of a frame."""
     corners: Any
     """(n, 2) int64: row and column of every window's first pixel."""
-    ny: Any
-    nx: Any
+    window: Any
+    """Its height and width, (ny, nx)."""
     box: Any
     """Side of the box, px; 0: no test."""
     limit: Any
@@ -188,16 +188,16 @@ def add_windows(test: Any, frames: Any, start: Any, stop: Any, weight: Any, mean
     weight : float
         Of the frame in the mean; pixels that are not finite do not count.
     """
-    lanes, nx, line = test.lanes, test.nx, frames.shape[2]
+    lanes, (ny, nx), line = test.lanes, test.window, frames.shape[2]
     width = width_of(lanes)
     limit, zero = splat(lanes, LARGEST_FLOAT32), splat(lanes, 0.0)
     for s in range(start, stop):
-        for y in range(test.ny):
+        for y in range(ny):
             for x in range(0, nx, width):
                 part = splat(lanes, weight)
                 if x + width > nx:  # a whole vector once more, of which the last pixels count
                     x, part = nx - width, part * load(lanes, test.last, 0)
-                at = (s * test.ny + y) * nx + x
+                at = (s * ny + y) * nx + x
                 before = load(lanes, mean, at)
                 raw = widened(lanes, frames, (test.corners[s, 0] + y) * line + test.corners[s, 1] + x)
                 store(mean, at, before + select(absolute(raw) <= limit, (raw - before) * part, zero))
@@ -234,15 +234,15 @@ def frame_noise(test: Any, frames: Any, f: Any, windows: Any, flags: Any, scratc
 def _border_difference(test: Any, frames: Any, f: Any, s: Any) -> Any:
     """Return the mean absolute difference of a window's two first and two last rows; -1 without any."""
     lanes, row, column = test.lanes, test.corners[s, 0], test.corners[s, 1]
-    width = width_of(lanes)
+    width, (ny, nx) = width_of(lanes), test.window
     zero, limit = splat(lanes, 0.0), splat(lanes, LARGEST_FLOAT32)
     total = count = zero
     for end in range(2):
-        y = row + end * (test.ny - 2)
-        for x in range(0, test.nx, width):
+        y = row + end * (ny - 2)
+        for x in range(0, nx, width):
             once = splat(lanes, 1.0)
-            if x + width > test.nx:  # a whole vector once more, of which the last pixels count
-                x, once = test.nx - width, load(lanes, test.last, 0)
+            if x + width > nx:  # a whole vector once more, of which the last pixels count
+                x, once = nx - width, load(lanes, test.last, 0)
             here = _calibrated(test, frames, f, y, column + x)
             difference = absolute(here - _calibrated(test, frames, f, y + 1, column + x))
             good = difference <= limit
@@ -269,7 +269,7 @@ def peak_above_border(test: Any, frames: Any, f: Any, s: Any, scratch: Any) -> A
     Bad pixels count as the background; infinite without a good pixel on every side. `scratch` is used behind
     its first 2 * `SAMPLED` elements.
     """
-    lanes, ny, nx, box = test.lanes, test.ny, test.nx, test.box
+    lanes, (ny, nx), box = test.lanes, test.window, test.box
     width = width_of(lanes)
     image = 2 * SAMPLED
     sums = image + ny * nx + width + box

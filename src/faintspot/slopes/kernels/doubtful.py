@@ -90,18 +90,19 @@ def flag_doubtful(x: Any, y: Any, flux: Any, flags: Any, expected: Any, scratch:
             at_y[s] = np.float32(math.nan) if unmeasured else y[f, s]
         for s in range(n, padded + 1):
             at_x[s] = at_y[s] = math.nan
-        if _is_any_suspect(at_x, at_y, expected):  # only then all lines of all spots are needed
-            _compare(f, x, y, flux, flags, expected, at_x, at_y, rest)
+        if _is_any_suspect((at_x, at_y), expected):  # only then all lines of all spots are needed
+            _compare(f, x, y, flux, flags, expected, (at_x, at_y), rest)
 
 
 @compiled
-def _away(lanes: Any, first: Any, at_x: Any, at_y: Any, expected: Any, enough: Any) -> Any:
+def _away(lanes: Any, first: Any, at: Any, expected: Any, enough: Any) -> Any:
     """Return the squared differences of W slopes from the most similar of their lines; infinite without one.
 
     The first ones are divided by their variance for slopes of error 1, the second ones are in px^2. Lines are
     looked at until no second one is `enough` or more.
     """
-    one, here_x, here_y = splat(lanes, 1.0), load(lanes, at_x, first), load(lanes, at_y, first)
+    one, (at_x, at_y) = splat(lanes, 1.0), at
+    here_x, here_y = load(lanes, at_x, first), load(lanes, at_y, first)
     square = least = splat(lanes, math.inf)
     for k in range(expected.far.shape[0]):
         place = 2 * k * expected.far.shape[1] + first
@@ -123,22 +124,20 @@ def _away(lanes: Any, first: Any, at_x: Any, at_y: Any, expected: Any, enough: A
 
 
 @compiled
-def _is_any_suspect(at_x: Any, at_y: Any, expected: Any) -> Any:
+def _is_any_suspect(at: Any, expected: Any) -> Any:
     """Return whether a slope may differ from each of its lines by more than the difference that counts."""
     lanes, width = expected.lanes, width_of(expected.lanes)
     like = splat(lanes, np.float32(0.99) * expected.least * expected.least)
     infinite, zero = splat(lanes, math.inf), splat(lanes, 0.0)
     for first in range(0, expected.far.shape[1], width):
-        least = _away(lanes, first, at_x, at_y, expected, like)[1]
+        least = _away(lanes, first, at, expected, like)[1]
         if any_lane(select(least < infinite, least, zero) >= like):
             return True
     return False
 
 
 @compiled
-def _compare(
-    f: Any, x: Any, y: Any, flux: Any, flags: Any, expected: Any, at_x: Any, at_y: Any, scratch: Any
-) -> None:
+def _compare(f: Any, x: Any, y: Any, flux: Any, flags: Any, expected: Any, at: Any, scratch: Any) -> None:
     """Compare the slopes of a frame with their lines, and flag those unlike all their neighbours."""
     lanes, width = expected.lanes, width_of(expected.lanes)
     n, padded, largest, other_flux = x.shape[1], expected.far.shape[1], np.float32(0.0), 0
@@ -146,7 +145,7 @@ def _compare(
     infinite, zero, none = splat(lanes, math.inf), splat(lanes, 0.0), splat(lanes, -1.0)
     counts = splat(lanes, expected.least)
     for first in range(0, padded, width):
-        square, least = _away(lanes, first, at_x, at_y, expected, none)
+        square, least = _away(lanes, first, at, expected, none)
         is_one = square < infinite
         least = square_root(select(is_one, least, zero))
         store(differences, first, select(is_one, square_root(square), none))

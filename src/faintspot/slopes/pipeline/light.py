@@ -52,7 +52,7 @@ def light_test(
     last[lanes.width - nx % lanes.width :] = 1.0
     corners, numbers = np.ascontiguousarray(layout.corners), (np.float32(limit), np.float32(unit))
     none = np.zeros(0, np.int64)
-    return LightTest(lanes, last, np.ascontiguousarray(maps), corners, ny, nx, box, *numbers, none)
+    return LightTest(lanes, last, np.ascontiguousarray(maps), corners, (ny, nx), box, *numbers, none)
 
 
 class MeanLight:
