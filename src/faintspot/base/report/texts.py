@@ -154,7 +154,7 @@ class Words(Formatter):
 class Texts:
     """Texts of a package by dotted names; {names} in them are replaced by values.
 
-    A text is a string or a list of sentences; one that begins with a semicolon goes on with the one before.
+    A text is a string or a list of sentences; one that begins with a semicolon continues the one before.
     A sentence with a value that is None or False is left out; True stands for no word. Formats are those of
     `Words`.
 

@@ -220,7 +220,7 @@ class Follower:
     """
 
     holds = "values"
-    """What the stream holds, for messages."""
+    """Contents of the stream, for messages."""
 
     def __init__(
         self,
@@ -242,11 +242,11 @@ class Follower:
 
     @property
     def meanwhile(self) -> str:
-        """What is done without a stream, for messages."""
+        """Activity without a stream, for messages."""
         return "waiting"
 
     def prepare(self, source: Stream) -> None:
-        """Get ready for a stream that was opened, before that is said."""
+        """Get ready for a newly opened stream, before its opening is reported."""
 
     def look(self, period_s: float = 0.0) -> Stream | None:
         """Close a stream that was removed or recreated, and open a missing one, at most once in `period_s`.

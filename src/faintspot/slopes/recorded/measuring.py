@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, TypedDict, Unpack
+from typing import TYPE_CHECKING, Any, TypedDict, Unpack
 
 import numpy as np
 from numpy.typing import NDArray
@@ -187,39 +187,39 @@ def measure_recorded(
             coordinates=layout_coordinates(layout),
             overwrite=overwrite,
         ) as writer:
-            _Run(source, measure, kept, follow, factor).write(writer, block_frames, summary, progress)
+            _write(writer, measure, source, summary, kept, factor, block_frames, progress)
     return summary
 
 
-class _Run(NamedTuple):
-    """Frames, and how they are measured."""
+def _write(
+    writer: SlopeWriter,
+    measure: SlopePipeline | SpotFollower,
+    source: FrameSource,
+    summary: Summary,
+    kept: SubapertureFlag,
+    factor: float,
+    block_frames: int | None,
+    progress: Progress | None,
+) -> None:
+    """Measure the frames that are not finished, and count what they show.
 
-    source: FrameSource
-    measure: SlopePipeline | SpotFollower
-    kept: SubapertureFlag
-    follow: bool
-    factor: float
-    """Pixels in the unit of the output."""
-
-    def write(
-        self, writer: SlopeWriter, block_frames: int | None, summary: Summary, progress: Progress | None
-    ) -> None:
-        """Measure the frames that are not finished, and count what they show."""
-        source, prepared, last = self.source, self.measure.plan.prepared, None
-        summary.resumed_at = done = writer.finished()
-        faults, size = prepared.faults, block_frames or _block_frames(source, self.follow)
-        again = source.blocks(0, done, size) if self.follow and done < source.n_frames else ()
-        for start, block in itertools.chain(again, source.blocks(done, source.n_frames, size)):
-            slopes = replace(self.measure(block), keep=self.kept)
-            if start >= done:
-                writer.append(start, scaled_positions(slopes.variables, self.factor))
-                summary.add(slopes)
-                summary.repeated_frames += int(np.count_nonzero(are_repeated(block, last)))
-            last = block[-1]
-            if progress is not None:
-                progress(start + len(block), source.n_frames)
-        if failed := prepared.faults - faults:
-            summary.notes.append(f"{failed} frames without slopes: {prepared.fault}")
+    `factor` is a pixel in the unit of the output.
+    """
+    prepared, last, follows = measure.plan.prepared, None, not isinstance(measure, SlopePipeline)
+    summary.resumed_at = done = writer.finished()
+    faults, size = prepared.faults, block_frames or _block_frames(source, follows)
+    again = source.blocks(0, done, size) if follows and done < source.n_frames else ()
+    for start, block in itertools.chain(again, source.blocks(done, source.n_frames, size)):
+        slopes = replace(measure(block), keep=kept)
+        if start >= done:
+            writer.append(start, scaled_positions(slopes.variables, factor))
+            summary.add(slopes)
+            summary.repeated_frames += int(np.count_nonzero(are_repeated(block, last)))
+        last = block[-1]
+        if progress is not None:
+            progress(start + len(block), source.n_frames)
+    if failed := prepared.faults - faults:
+        summary.notes.append(f"{failed} frames without slopes: {prepared.fault}")
 
 
 def _pipeline(
