@@ -189,7 +189,10 @@ def _streamed(pipeline: fs.SlopePipeline, frames: NDArray[Any], at_end: bool) ->
     with _guarded_scratch(at_end):
         path = FramePath(pipeline, [guarded(frames[0], at_end)], Progress(cells, 0, 1))
     for groups in filter(None, (path._wide, path._narrow)):
-        groups._work = [guarded_tree(work, at_end) for work in groups._work]
+        groups.arguments = [
+            work._replace(source=guarded_tree(work.source, at_end), task=guarded_tree(work.task, at_end))
+            for work in groups.arguments
+        ]
         groups._last_rows = guarded(groups._last_rows, at_end)
     assert path.measure(0)
     path.flag_doubtful()

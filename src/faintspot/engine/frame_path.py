@@ -17,8 +17,8 @@ from faintspot.engine.workers import SlopePrior, Workers
 from faintspot.loop.control.configuration import prior_std_px
 from faintspot.slopes.kernels import streaming
 from faintspot.slopes.kernels.compiling import Direct
-from faintspot.slopes.kernels.groups import DENOISED, ERROR_SCALE, STAGE_ROWS, SlopeArrays, new_scratch
-from faintspot.slopes.kernels.host import WIDTHS, lanes_for
+from faintspot.slopes.kernels.groups import DENOISED, ERROR_SCALE, STAGE_ROWS, SlopeArrays
+from faintspot.slopes.kernels.host import WIDTHS
 from faintspot.slopes.kernels.products import NO_PRODUCT, ProductPart
 from faintspot.slopes.pipeline.slope_pipeline import SlopePipeline
 from faintspot.slopes.pipeline.slopes import RESULT_TYPES, Slopes
@@ -51,6 +51,8 @@ class _Groups:
     ----------
     pipeline, slots, prior
         As for `FramePath`.
+    results : (SlopeArrays, array)
+        Slopes, and images after every step.
     groups : (int, int)
         First group, and the one after the last.
     shares : int
@@ -61,6 +63,7 @@ class _Groups:
         self,
         pipeline: SlopePipeline,
         slots: Sequence[NDArray[np.generic]] | NDArray[np.generic],
+        results: tuple[SlopeArrays, NDArray[np.float32]],
         groups: tuple[int, int],
         shares: int,
         prior: SlopePrior | None,
@@ -73,15 +76,16 @@ class _Groups:
         task = task._replace(settings=task.settings.copy())
         self.settings: NDArray[np.float32] = task.settings[0]
         """Settings of every sub-aperture for the kernel: rows as in `kernels.groups`."""
-        self._work = [(pipeline.source(slot[None], slot.dtype), task) for slot in slots]
+        slopes, stages = results
+        self.arguments = [pipeline.arguments(slot[None], slot.dtype, task, slopes=slopes) for slot in slots]
+        """Arguments of the kernels for each slot."""
+        self._explaining = [arguments._replace(stages=stages) for arguments in self.arguments]
         self._width, self._frame_rows = pipeline.width, int(last_rows_of_groups(pipeline, 1).max())
         self._kernel = Direct(streaming.streamed(pipeline.plan.prepared.kernel))
         self._multiply = Direct(streaming.multiply_until)
         self._sleep = Direct(streaming.sleep_until_due)
-        lanes, window = lanes_for(np.float32, pipeline.width), pipeline.layout.window
-        own_scratch = pipeline.plan.own_scratch
         self._due = np.zeros(len(self._last_rows), np.int64)
-        self._scratch = [new_scratch(lanes, *window, own_scratch(lanes, *window)) for _ in range(shares)]
+        self._scratch = [pipeline.new_scratch() for _ in range(shares)]
 
     def measure(
         self,
@@ -89,38 +93,44 @@ class _Groups:
         frame: tuple[int, int],
         progress: Progress,
         waiting: tuple[NDArray[np.int64], NDArray[np.int64]],
-        after: tuple[object, ...],
+        explain: bool,
         part: ProductPart = NO_PRODUCT,
         rehearse: Rehearsal | None = None,
     ) -> bool:
         """Measure one share of a frame (number, slot); return whether it was completed.
 
         `waiting` has the cell that ends waiting, and the share's `Arrival.pace`. See `FramePath.measure` for
-        `part` and `rehearse`.
+        the others.
         """
-        number, work = frame[0], self._work[frame[1]]
+        number, slot = frame
+        work = (self._explaining if explain else self.arguments)[slot]
         start, last, stop = self._ranges[share]
         control, pace = waiting
         cells = progress.cells, progress.frame_cell, progress.rows_cell
         arrival = streaming.Arrival(*cells, control, STOP_CELL, pace, self._due)
-        arguments = self._scratch[share], *after, part
+
+        def stream(awaited: int, first: int, end: int) -> int:
+            groups = work.measuring(first, end, self._scratch[share])
+            done: int = self._kernel(arrival, awaited, self._last_rows, *groups, part)
+            return done
+
         pace[streaming.PENDING] = start
         if rehearse is not None:
             for group in sorted({start, last}):
-                if self._kernel(arrival, number, self._last_rows, *work, start, group, *arguments) < group:
+                if stream(number, start, group) < group:
                     return False
                 start = group
                 if group == stop:
                     break
                 rows = self._last_rows[group]
-                self._multiply(arrival, number, rows, group, self._width, after[0], part)
+                self._multiply(arrival, number, rows, group, self._width, work.slopes, part)
                 if self._sleep(arrival, number, rows, group):
                     # A frame that has passed is not waited for: only code and data come into the cache again.
-                    self._kernel(arrival, -1, self._last_rows, *work, last, last + 1, *arguments)
+                    stream(-1, last, last + 1)
                     rehearse()
                     pace[streaming.COLD] = 0
-        done: int = self._kernel(arrival, number, self._last_rows, *work, start, stop, *arguments)
-        self._multiply(arrival, number, self._frame_rows, done, self._width, after[0], part)
+        done = stream(number, start, stop)
+        self._multiply(arrival, number, self._frame_rows, done, self._width, work.slopes, part)
         return done == stop
 
     def _range(self, start: int, stop: int) -> tuple[int, int, int]:
@@ -183,19 +193,19 @@ class FramePath:
         # The remainder is measured in a narrower group if that is faster; it has the last rows.
         faster = rest > 0 and pipeline.plan.prepared.fewer_lanes_are_faster
         narrow = [width for width in WIDTHS if rest <= width < wide] if faster else []
-        self._wide = _Groups(pipeline, slots, (0, full if narrow else full + (rest > 0)), self._shares, prior)
+        groups, after = (0, full if narrow else full + (rest > 0)), (results, self._stages)
+        self._wide = _Groups(pipeline, slots, after, groups, self._shares, prior)
+        self._checks = [pipeline.check(arguments) for arguments in self._wide.arguments]
         self._narrow = None
         if narrow:
             width = min(narrow)
             groups = full * wide // width, full * wide // width + 1
-            self._narrow = _Groups(pipeline.with_width(width), slots, groups, 1, prior)
+            self._narrow = _Groups(pipeline.with_width(width), slots, after, groups, 1, prior)
         self._prior, self._prior_changes = prior, 0
         self._dark_changes = 0
         self._usual_std_px = prior_std_px(pipeline.settings, pipeline.layout)
         self.prior_std_px = None if prior is None else self._usual_std_px
         """Standard deviation of the slopes' prior, (2 n,); None: no prior."""
-        self._plain = results, self._stages[:0]
-        self._explaining = results, self._stages
 
     @property
     def denoised(self) -> NDArray[np.float32]:
@@ -227,7 +237,7 @@ class FramePath:
         if self._prior is not None:
             self._await_row(cell_progress, 0)
         for share in range(self._shares):
-            self._work(share, (0, 0), cell_progress, self._explaining, rehearse=lambda: None)
+            self._work(share, (0, 0), cell_progress, explain=True, rehearse=lambda: None)
         self.flag_doubtful()
 
     def measure(
@@ -268,17 +278,16 @@ class FramePath:
             self._widen(self._prior)
         self._slot = number % len(self._frames) if slot is None else slot
         frame = number, self._slot
-        after = self._explaining if explain else self._plain
         parts = product or self._no_product
         if self._workers is None:
-            return self._work(0, frame, self._progress, after, parts[0], rehearse)
-        self._workers.post(lambda share: self._work(share, frame, self._progress, after, parts[share]))
-        completed = self._work(0, frame, self._progress, after, parts[0], rehearse)
+            return self._work(0, frame, self._progress, explain, parts[0], rehearse)
+        self._workers.post(lambda share: self._work(share, frame, self._progress, explain, parts[share]))
+        completed = self._work(0, frame, self._progress, explain, parts[0], rehearse)
         return self._workers.wait() and completed
 
     def flag_doubtful(self) -> None:
         """Set the flags of the last frame that depend on all its slopes; see `SlopePipeline`."""
-        self.pipeline.flag_doubtful(self._results, self._frames[self._slot])
+        self._checks[self._slot]()
 
     @property
     def frame(self) -> NDArray[Any]:
@@ -325,17 +334,17 @@ class FramePath:
         share: int,
         frame: tuple[int, int],
         progress: Progress,
-        after: tuple[object, ...],
+        explain: bool,
         part: ProductPart = NO_PRODUCT,
         rehearse: Rehearsal | None = None,
     ) -> bool:
         """Measure one share of a frame's groups; the last share includes the narrow group."""
         waiting = self._control, self._pace[share]
         narrow = self._narrow if share == self._shares - 1 else None
-        completed = self._wide.measure(share, frame, progress, waiting, after, part, rehearse)
+        completed = self._wide.measure(share, frame, progress, waiting, explain, part, rehearse)
         if narrow is None:
             return completed
-        return completed and narrow.measure(0, frame, progress, waiting, after, rehearse=rehearse)
+        return completed and narrow.measure(0, frame, progress, waiting, explain, rehearse=rehearse)
 
     def _widen(self, prior: SlopePrior) -> None:
         """Set the width of the estimator's prior to the uncertainty of the prediction, where known."""

@@ -3,7 +3,7 @@
 import math
 import threading
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,11 +14,12 @@ from faintspot.slopes.estimators.base import Estimator, EstimatorPlan
 from faintspot.slopes.estimators.sensor import Sensor
 from faintspot.slopes.kernels import groups
 from faintspot.slopes.kernels.compiling import Direct
+from faintspot.slopes.kernels.dark import LightTest
 from faintspot.slopes.kernels.doubtful import Expected
 from faintspot.slopes.kernels.groups import Scratch, SlopeArrays, Source, Task
 from faintspot.slopes.kernels.host import lanes_for
 from faintspot.slopes.pipeline.settings import Settings, spot_fwhm_px
-from faintspot.slopes.pipeline.slopes import RESULT_TYPES, Slopes
+from faintspot.slopes.pipeline.slopes import Slopes
 from faintspot.slopes.sensor.layout import Layout
 from faintspot.slopes.sensor.region import (
     LEAST_DIFFERENCE,
@@ -228,7 +229,7 @@ class Plan:
         edge = np.where(fwhm < half, half - 0.5 * fwhm, np.inf)
         pitch = layout.pitch_px
         neighbours = neighbours_of(layout.cells, layout.geometry, diagonal=True)
-        lanes = lanes_for(np.float32)
+        lanes = lanes_for(np.float32, sensor.width)
         return Expected(
             lanes,
             np.ascontiguousarray(sensor.zero.T, np.float32),
@@ -255,37 +256,53 @@ class Plan:
 NO_STAGES = np.empty((0, 0, 0, 0), np.float32)
 
 
+class FrameArguments(NamedTuple):
+    """Arrays and numbers that kernels read and write for frames in fixed memory."""
+
+    source: Source
+    task: Task
+    slopes: SlopeArrays
+    stages: NDArray[np.float32]
+    light_test: LightTest
+    expected: Expected
+
+    @property
+    def groups(self) -> int:
+        """Number of groups in all frames."""
+        n_frames, n = len(self.source.frames), len(self.source.corners)
+        return n_frames * int(-(-n // self.source.lanes.width))
+
+    def measuring(self, start: int, stop: int, scratch: Scratch) -> tuple[Any, ...]:
+        """Return the arguments of `groups.measure_groups` for a thread's groups."""
+        return self.source, self.task, start, stop, scratch, self.slopes, self.stages
+
+    def checking(self, scratch: NDArray[np.float32]) -> tuple[Any, ...]:
+        """Return the arguments of `doubtful.check_slopes`."""
+        return self.light_test, self.source.frames, self.slopes, self.expected, scratch
+
+
 class SmallFrames:
     """Measurement of frames of one type, one at a time, in one thread; all memory is allocated once.
 
     Parameters
     ----------
-    plan : Plan
-        Of an estimator with a kernel, whose settings do not depend on the flux of each frame.
-    source : Source
-        A frame (1, h, w), into which each frame is copied, and its calibration.
+    kernel : Direct
+        Compiled function that measures groups, of settings that do not depend on the flux of each frame.
+    arguments : FrameArguments
+        Of a frame (1, h, w), into which each frame is copied.
     scratch : Scratch
         Memory of the thread.
     check : function
-        Returns a function that sets the flags that depend on all slopes; see `SlopePipeline.flag_doubtful`.
+        Sets the flags that depend on all slopes; see `SlopePipeline.flag_doubtful`.
     """
 
     def __init__(
-        self,
-        plan: Plan,
-        source: Source,
-        scratch: Scratch,
-        check: Callable[[SlopeArrays, NDArray[np.generic]], Callable[[], None]],
+        self, kernel: Direct, arguments: FrameArguments, scratch: Scratch, check: Callable[[], None]
     ) -> None:
-        n = len(source.corners)
-        groups = -(-n // source.lanes.width)
-        self._frame = source.frames[0]
-        self._results = SlopeArrays(*(np.empty((1, n), kind) for kind in RESULT_TYPES))
-        self._slopes = [result[0] for result in self._results]
-        self._kernel = plan.kernel(source.frames)
-        task = plan.task(np.zeros(1, np.int64))
-        self._arguments = source, task, 0, groups, scratch, self._results, NO_STAGES
-        self._check = check(self._results, source.frames)
+        self._frame = arguments.source.frames[0]
+        self._slopes = [result[0] for result in arguments.slopes]
+        self._kernel, self._check = kernel, check
+        self._arguments = arguments.measuring(0, arguments.groups, scratch)
 
     def __call__(self, frame: NDArray[np.generic]) -> Slopes:
         """Measure a frame (h, w)."""

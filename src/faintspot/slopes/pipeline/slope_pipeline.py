@@ -23,7 +23,15 @@ from faintspot.slopes.estimators.base import Estimator
 from faintspot.slopes.kernels.compiling import Direct
 from faintspot.slopes.kernels.dark import scratch_size
 from faintspot.slopes.kernels.doubtful import check_slopes, doubtful_scratch_size
-from faintspot.slopes.kernels.groups import CALIBRATED, STAGE_ROWS, Scratch, SlopeArrays, Source
+from faintspot.slopes.kernels.groups import (
+    CALIBRATED,
+    STAGE_ROWS,
+    Scratch,
+    SlopeArrays,
+    Source,
+    Task,
+    new_scratch,
+)
 from faintspot.slopes.kernels.host import lanes_for
 from faintspot.slopes.kernels.parallel import most_threads, run_groups, thread_scratch
 from faintspot.slopes.kernels.simd import Lanes
@@ -32,6 +40,7 @@ from faintspot.slopes.pipeline.light import MeanFlux, MeanLight, light_test
 from faintspot.slopes.pipeline.plan import (
     KERNEL_TYPES,
     NO_STAGES,
+    FrameArguments,
     Plan,
     SmallFrames,
     kernel_frames,
@@ -140,8 +149,7 @@ class SlopePipeline:
         self.light_test = light_test(self.binned_layout, maps, self.plan.typical_fwhm_px)
         """Test for sub-apertures without flux."""
         sizes = scratch_size(*self.binned_layout.window), doubtful_scratch_size(len(self.layout))
-        self._scratch_size = max(sizes)
-        self._checks = {dtype: _checks(dtype, self.light_test.lanes) for dtype in KERNEL_TYPES}
+        self._check_scratch_size = max(sizes)
 
     @property
     def width(self) -> int:
@@ -316,8 +324,9 @@ class SlopePipeline:
         if not simple or most_threads(groups, lanes, window, plan.estimator.cost) > 1:
             return None
         frames = np.empty((1, *self.layout.frame_shape), np.float32 if dtype.kind == "f" else np.uint16)
+        arguments = self.arguments(frames, dtype)
         scratch = thread_scratch(lanes, window, plan.own_scratch)
-        return SmallFrames(plan, self.source(frames, dtype), scratch, self._check)
+        return SmallFrames(plan.kernel(frames), arguments, scratch, self.check(arguments))
 
     def explain(self, frame: ArrayLike, prior: ArrayLike | Slopes | None = None) -> Stages:
         """Return the sub-aperture images after every step, for figures and for debugging.
@@ -355,33 +364,69 @@ class SlopePipeline:
             array = binned(array, factor, self.calibration.saturation(dtype))
         frames = kernel_frames(array)
         n_frames, n = len(frames), len(self.layout)
-        results = SlopeArrays(*[np.empty((n_frames, n), dtype) for dtype in RESULT_TYPES])
         prepared = self.plan.prepared
         stages = NO_STAGES
         if explain or prepared.in_python:
             stages = np.empty((STAGE_ROWS, n_frames, n, self.binned_layout.pixels), np.float32)
-        source = self.source(frames, dtype)
-        variants = self._variants(source)
         predicted = None if prior is None else prior_slopes(prior, n_frames, self.layout) / np.float32(factor)
-        task = self.plan.task(variants, predicted)
-        kernel = self.plan.kernel(frames)
+        task = self.plan.task(self._variants(self.source(frames, dtype)), predicted)
+        arguments = self.arguments(frames, dtype, task, stages=stages)
+        kernel, results = self.plan.kernel(frames), arguments.slopes
 
         def job(start: int, stop: int, scratch: Scratch) -> None:
-            kernel(source, task, start, stop, scratch, results, stages)
+            kernel(*arguments.measuring(start, stop, scratch))
 
-        n_groups = n_frames * -(-n // self._lanes.width)
         own_scratch = self.plan.own_scratch
-        cost = self.plan.estimator.cost
-        run_groups(job, n_groups, self._lanes, self.binned_layout.window, self.threads, own_scratch, cost)
+        cost, window = self.plan.estimator.cost, self.binned_layout.window
+        run_groups(job, arguments.groups, self._lanes, window, self.threads, own_scratch, cost)
         if prepared.in_python:
             images = stages[CALIBRATED].reshape(n_frames, n, *self.binned_layout.window)
             for f in range(n_frames):
                 predicted_f = task.prior[min(f, len(task.prior) - 1)]
                 prepared.locate_frame(images[f], predicted_f, task.settings[0], f, results)
-        self.flag_doubtful(results, frames)
+        self.check(arguments)()
         if factor > 1:
             results = SlopeArrays(**scaled_positions(results._asdict(), factor))
         return Slopes(*(results if array.ndim == 3 else [result[0] for result in results])), stages
+
+    def arguments(
+        self,
+        frames: NDArray[Any],
+        dtype: DTypeLike,
+        task: Task | None = None,
+        *,
+        slopes: SlopeArrays | None = None,
+        stages: NDArray[np.float32] = NO_STAGES,
+    ) -> FrameArguments:
+        """Return the arguments of the compiled functions for frames in fixed memory.
+
+        Parameters
+        ----------
+        frames, dtype
+            As for `source`.
+        task : Task, optional
+            Default: the first settings table, without a prior.
+        slopes : SlopeArrays, optional
+            Results, (n_frames, n). Default: new memory.
+        stages : (STAGE_ROWS or 0, n_frames, n, pixels) float32
+            Images after every step.
+        """
+        if task is None:
+            task = self.plan.task(np.zeros(len(frames), np.int64))
+        if slopes is None:
+            shape = len(frames), len(self.layout)
+            slopes = SlopeArrays(*(np.empty(shape, kind) for kind in RESULT_TYPES))
+        source = self.source(frames, dtype)
+        return FrameArguments(source, task, slopes, stages, self.light_test, self.plan.expected)
+
+    def new_scratch(self) -> Scratch:
+        """Return the memory of one more thread that measures."""
+        window = self.binned_layout.window
+        return new_scratch(self._lanes, *window, self.plan.own_scratch(self._lanes, *window))
+
+    def new_check_scratch(self) -> NDArray[np.float32]:
+        """Return the memory of one more thread that sets the flags which need whole frames."""
+        return np.empty(self._check_scratch_size, np.float32)
 
     def flag_doubtful(self, results: SlopeArrays, frames: NDArray[Any]) -> None:
         """Flag dark sub-apertures of bright frames, and spots cut by their window or unlike all neighbours.
@@ -395,13 +440,12 @@ class SlopePipeline:
             Slopes of the frames; changed.
         frames : (n, h, w) array, uint16 or float32, contiguous
         """
-        self._check(results, frames)()
+        self.check(self.arguments(frames, frames.dtype, slopes=results))()
 
-    def _check(self, results: SlopeArrays, frames: NDArray[Any]) -> Callable[[], None]:
-        """Return `flag_doubtful` for these arrays, to be called for all frames that are written to them."""
-        scratch = np.empty(self._scratch_size, np.float32)
-        kernel = self._checks[frames.dtype]
-        return partial(kernel, self.light_test, frames, results, self.plan.expected, scratch)
+    def check(self, arguments: FrameArguments) -> Callable[[], None]:
+        """Return `flag_doubtful` for these arguments, to be called for all frames written to their memory."""
+        kernel = _checks(arguments.source.frames.dtype, self.light_test.lanes, self._lanes)
+        return partial(kernel, *arguments.checking(self.new_check_scratch()))
 
     def source(self, frames: NDArray[np.generic], dtype: DTypeLike) -> Source:
         """Return the frames in the form that kernels read.
@@ -434,8 +478,8 @@ class SlopePipeline:
 
 
 @cache
-def _checks(dtype: np.dtype[np.generic], lanes: Lanes) -> Direct:
-    """Return `check_slopes` for frames of a type, and windows whose pixels are in so many lanes."""
+def _checks(dtype: np.dtype[np.generic], pixels: Lanes, subapertures: Lanes) -> Direct:
+    """Return `check_slopes` for frames of a type, and so many pixels and sub-apertures at once."""
     return Direct(check_slopes)
 
 
