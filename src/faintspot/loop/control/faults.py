@@ -28,6 +28,7 @@ _SURE = 2.0  # standard errors
 # no later response of the median actuator is as large as the second number.
 _DELAYS, _LATER = range(2, 6), 0.15
 _RIDGE, _RCOND = 1e-3, 0.05
+_FEW_SLOPES, _BY_CHANCE = 8, 5.0  # slopes whose values are counted; repeats in those of equally likely values
 _ALIKE = 1e-9  # difference of two slopes that follow each other, in their standard deviations
 # In the loop: frames after which slopes are compared (those alike twice in a row follow each other), the
 # largest part of them that may, and a sequence in [0, 1) on which they are projected.
@@ -173,6 +174,25 @@ def stuck_slopes(slopes: Floats) -> Mask:
             watch(known[frame], errors[frame])
             stuck[frame] |= watch.sticks
     return stuck
+
+
+def rows_without_measurement(slopes: Floats) -> Mask:
+    """Return the frames whose slopes are all 0, not measured, or those of an earlier frame, (frames,).
+
+    Few coarse slopes repeat by chance: such rows count as measured.
+
+    Parameters
+    ----------
+    slopes : (frames, m) array
+        NaN where not measured.
+    """
+    rows = np.where(np.isfinite(slopes), slopes, 0.0) + 0.0  # -0.0 is 0.0
+    _, first = np.unique([hash(row.tobytes()) for row in rows], return_index=True)
+    is_none = np.isin(np.arange(len(rows)), first, invert=True) | ~rows.any(axis=1)
+    moving = rows[:, np.ptp(rows, axis=0) > 0][:, :_FEW_SLOPES]
+    states = math.prod(float(len(np.unique(values))) for values in moving.T)
+    by_chance = _BY_CHANCE * np.count_nonzero(np.isfinite(slopes).any(axis=1)) ** 2 / states
+    return np.asarray(is_none if is_none.sum() > by_chance else ~np.isfinite(slopes).any(axis=1))
 
 
 def followers(slopes: Floats) -> Mask:

@@ -177,3 +177,57 @@ def test_slopes_without_sub_apertures() -> None:
     assert any("slope 4" in remark for remark in ready.recording.remarks)
     with refused("covariance_xy"):
         replace(loop, cells=None, covariance_xy=np.zeros((len(loop.slopes), 25)))
+
+
+def slowly(loop: Recording, between: str, every: int = 2) -> Recording:
+    """Return a loop whose sensor integrates over some rows, with slopes in the last of them alone."""
+    rows: dict[str, Any] = {
+        name: np.repeat(getattr(loop, name), every, axis=0) for name in ("slopes", "commands")
+    }
+    is_exposure = np.arange(len(rows["slopes"])) % every == every - 1
+    if between == "repeats":
+        rows["slopes"] = np.roll(rows["slopes"], every - 1, axis=0)
+        rows["slopes"][: every - 1] = 0.0
+    else:
+        rows["slopes"][~is_exposure] = {"zeros": 0.0, "nothing": np.nan}[between]
+    return replace(loop, **rows, frame=None, frame_rate_hz=every * loop.frame_rate_hz)
+
+
+@pytest.mark.parametrize(("between", "every"), [("zeros", 2), ("repeats", 2), ("nothing", 3)])
+def test_exposures_over_several_rows_are_the_frames(between: str, every: int) -> None:
+    loop = recorded().part(slice(0, 400))
+    ready = prepared(slowly(loop, between, every)).recording
+    assert len(ready.slopes) == 400
+    assert ready.frame_rate_hz == pytest.approx(loop.frame_rate_hz)
+    assert np.unique(np.diff(ready.frame)).tolist() == [1]
+    np.testing.assert_allclose(ready.unit * ready.slopes, loop.slopes, rtol=1e-9)
+    assert any(f"{400 * (every - 1)} of" in remark for remark in ready.remarks)
+
+
+def test_a_row_that_is_lost_without_a_number_loses_no_exposure() -> None:
+    loop = slowly(recorded().part(slice(0, 400)), "zeros", 3)
+    rows = np.arange(1200) != 301
+    ready = prepared(replace(loop.part(rows), frame=None)).recording
+    np.testing.assert_array_equal(ready.frame, np.arange(400))
+
+
+def test_a_stated_delay_is_that_of_exposures() -> None:
+    """A command that acts two rows later acts in the second half of the next exposure of two rows."""
+    loop = slowly(recorded().part(slice(0, 300)), "zeros")
+    ready = prepared(replace(loop, delay_frames=2.0, sent_after_frames=1)).recording
+    assert ready.delay_frames == pytest.approx(1.5)
+
+
+def test_rows_of_zeros_here_and_there_are_not_measured() -> None:
+    loop = recorded().part(slice(0, 400))
+    slopes, blank = loop.slopes.copy(), np.arange(400) % 7 < 2
+    slopes[blank] = 0.0
+    ready = prepared(replace(loop, slopes=slopes)).recording
+    np.testing.assert_array_equal(np.isnan(ready.slopes).all(axis=1), blank)
+    np.testing.assert_array_equal(ready.commands, loop.commands)
+
+
+def test_coarse_slopes_repeat_by_chance() -> None:
+    slopes = np.random.default_rng(1).integers(-5, 6, (500, 2)).astype(float)
+    ready = prepared(Recording(slopes, None, None, None, 100.0))
+    assert np.isfinite(ready.recording.slopes).all()

@@ -20,7 +20,7 @@ from faintspot.base.checks import (
 )
 from faintspot.base.errors import InputError
 from faintspot.base.options import Option
-from faintspot.loop.control.faults import followers, still_actuators, stuck_slopes
+from faintspot.loop.control.faults import followers, rows_without_measurement, still_actuators, stuck_slopes
 from faintspot.loop.control.reconstructor import make_reconstructor
 from faintspot.loop.slope_covariance import modes_of_turbulence, order_remark
 
@@ -33,6 +33,7 @@ _STEPS_FOR_TEST = 200  # fewest of them
 _PER_FRAME = ("slopes", "commands", "frame", "standard_errors", "covariance_xy")
 _ARRAYS = ("slopes", "commands", "interaction_matrix", "standard_errors", "covariance_xy", "prior_std")
 _MOST_CELLS = 1000  # rows or columns of the lenslet array
+_REGULAR = 0.9  # least part of the gaps between exposures that are whole numbers of exposures
 _NAMED = 5  # sub-apertures in a remark
 _BROKEN = 1e6  # rms of a slope relative to the median one
 _LARGEST = 1e30  # whose square is a number
@@ -206,6 +207,7 @@ def prepared(recording: Recording) -> Prepared:
         When the slopes do not vary, are in another order than the cells, or the commands have nothing to do
         with them.
     """
+    recording = _exposures(recording)
     slopes = recording.slopes[np.isfinite(recording.slopes)]
     if not slopes.size:
         raise InputError(f"{recording.name}: expected slopes, got none that were measured")
@@ -223,6 +225,33 @@ def prepared(recording: Recording) -> Prepared:
         return Prepared(scaled, 1.0, 0, math.inf)
     ready = _with_convention(scaled)
     return ready._replace(recording=_without_still_actuators(ready.recording))
+
+
+def _exposures(recording: Recording) -> Recording:
+    """Return a recording without rows that are no measurements: slopes of 0, or those of an earlier row.
+
+    Where every k-th row alone is one, these are the frames: the sensor integrates over k rows of the loop.
+    """
+    frame, blank = recording.frame, rows_without_measurement(recording.slopes)
+    kept = frame[~blank]
+    if not blank.any() or len(kept) < 2:
+        return recording
+    remark = f"rows: {len(frame) - len(kept)} of {len(frame)} without a measurement: zeros, repeats or NaN"
+    gaps = np.diff(kept)
+    step = int(np.median(gaps))
+    if step == 1 or (gaps % step == 0).mean() < _REGULAR:
+        slopes = np.where(blank[:, None], np.nan, recording.slopes)
+        return replace(recording, slopes=slopes, remarks=(*recording.remarks, remark))
+    rate, delay, sent = recording.frame_rate_hz / step, recording.delay_frames, recording.sent_after_frames
+    remark += f"; one row in {step} is an exposure, so a frame is an exposure, at {rate:.6g} Hz"
+    return replace(
+        recording.part(~blank),
+        frame=np.cumsum(np.append(0, np.maximum(np.rint(gaps / step), 1))).astype(np.int64),
+        frame_rate_hz=rate,
+        delay_frames=None if delay is None else (delay + step - 1) / step,
+        sent_after_frames=None if sent is None else math.ceil(sent / step),
+        remarks=(*recording.remarks, remark),
+    )
 
 
 def _check_alike(recording: Recording) -> None:
