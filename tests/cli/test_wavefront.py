@@ -61,7 +61,8 @@ def test_drift_of_a_recording(run: Commands, slopes: Path, coarse_pictures: None
     np.testing.assert_allclose(written["drift"]["time"], np.array([0.5, 2.5, 4.5]) / 36)
     slope = np.polyfit(written["drift"]["time"], written["drift"]["mean"], 1)[0]
     np.testing.assert_allclose(written["drift"]["rate"], slope)
-    run.refused("wavefront", slopes, "--drift", 4, naming=("bins", "3"))
+    for bins in (0, 4):
+        run.refused("wavefront", slopes, "--drift", bins, naming=("bins", "3"))
 
 
 def test_unknown_values_are_null_with_a_reason(run: Commands, folder: Path, no_picture: None) -> None:

@@ -1,8 +1,11 @@
 """Estimators of files in a running engine: in, out, and given up when they fail; no frame is missing."""
 
+import contextlib
 import hashlib
 import os
+import threading
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -11,13 +14,14 @@ import pytest
 from click.testing import CliRunner
 from tests.engine.bench import SETTINGS, Bench, make, simulated
 from tests.engine.estimator_files import PEAK, write
+from tests.patience import LIMIT_S
 from tests.refusals import refused
 
 import faintspot as fs
 from faintspot.cli.realtime import command
 from faintspot.engine.estimators import EstimatorTrial, load_estimators
-from faintspot.engine.request_handlers import commands_of
-from faintspot.engine.requests import ControlServer, socket_path
+from faintspot.engine.request_handlers import LENGTHY, commands_of
+from faintspot.engine.requests import ControlServer, request, socket_path
 from faintspot.slopes.estimators import estimators
 from faintspot.slopes.estimators.registry import restore
 
@@ -208,6 +212,34 @@ def test_commands_load_replace_and_unload_estimators(
         run("unload", "mine")
         with pytest.raises(fs.InputError, match="No such file"):
             run("load", "none.py")
+
+
+def test_settings_change_during_a_trial(
+    camera: Camera, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A file that does not return has the time of its trial; settings and estimators change meanwhile."""
+    begun, end, ask = threading.Event(), threading.Event(), partial(request, socket_path(camera.name))
+
+    def endless(trial: EstimatorTrial) -> dict[str, Any]:
+        begun.set()
+        assert end.wait(LIMIT_S)
+        raise fs.InputError("did not return")
+
+    def load() -> None:
+        with contextlib.suppress(fs.InputError):
+            ask("load", timeout_s=LIMIT_S, source=str(write(tmp_path)))
+
+    monkeypatch.setattr(EstimatorTrial, "elsewhere", endless)
+    with ControlServer(socket_path(camera.name), commands_of(camera.engine), lengthy=LENGTHY):
+        loading = threading.Thread(target=load)
+        loading.start()
+        try:
+            assert begun.wait(LIMIT_S)
+            ask("set", timeout_s=LIMIT_S, changes={"search_range_px": 2.5})
+            assert camera.engine.live.newest.settings.search_range_px == 2.5
+        finally:
+            end.set()
+            loading.join(LIMIT_S)
 
 
 @pytest.mark.parametrize("then", ["", "raise ValueError('late')"])

@@ -123,11 +123,13 @@ def command(
         flat = None if interaction is None else flattening(measured, interaction, stroke)
     found = certify(wavefront, wavelength_nm=options["wavelength_nm"])
     with errors_of_options(slopes):
-        over_time = drift and fit_drift(wavefront, drift, frame_rate_hz=options["frame_rate_hz"])
+        over_time = None
+        if drift is not None:
+            over_time = fit_drift(wavefront, drift, frame_rate_hz=options["frame_rate_hz"])
     tables = [mode_table(wavefront), certificate_table(found, wavefront.unit)]
     _print([*tables, drift_table(over_time, wavefront)] if over_time else tables, wavefront, notes)
     if output is not None:
-        save_wavefront(output, wavefront, found, over_time or None)
+        save_wavefront(output, wavefront, found, over_time)
         click.echo(output)
     if drawing is not None:
         from faintspot.slopes.wavefront.figure import drift_figure, wavefront_figure

@@ -194,7 +194,8 @@ class EngineEstimators:
 
     def __init__(self, live: RunningSettings[EnginePlan], preparer: SettingsPreparer) -> None:
         self._live, self._preparer = live, preparer
-        self._lock = threading.Lock()
+        self.changing = threading.Lock()
+        """Lock of whatever changes settings or estimators; no trial of a file holds it."""
         self.loaded: dict[str, EstimatorFile] = {}
         """Files of loaded estimators, by the estimators' names."""
         self.fault: str | None = None
@@ -218,7 +219,7 @@ class EngineEstimators:
         path = Path(source)
         settings = self._preparer.built_in(self._live.settings)
         tried = EstimatorTrial(path, self._preparer.make_pipeline, settings).elsewhere()
-        with self._lock:
+        with self.changing:
             for name in tried["estimators"]:
                 if name in self.loaded and not replace:
                     raise InputError(
@@ -250,7 +251,7 @@ class EngineEstimators:
         InputError
             When no such estimator is loaded.
         """
-        with self._lock:
+        with self.changing:
             if name not in self.loaded:
                 names = ", ".join(self.loaded) or "none"
                 raise InputError(f"estimator {name!r}: not loaded, expected one of: {names}")

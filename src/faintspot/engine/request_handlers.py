@@ -1,7 +1,7 @@
 """Commands of a running engine's control channel."""
 
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -26,17 +26,25 @@ def commands_of(engine: Engine) -> dict[str, Handler]:
     return {
         "status": lambda fields: engine.status(),
         "get": lambda fields: {"settings": engine.live.get(fields.get("names"))},
-        "set": partial(_set, engine),
-        "interleave": partial(_interleave, engine),
+        "set": partial(_alone, _set, engine),
+        "interleave": partial(_alone, _interleave, engine),
         "loop": partial(loop_command, engine),
-        "learnt": partial(_take_learnt, engine),
-        "spots": partial(_take_spots, engine),
+        "learnt": partial(_alone, _take_learnt, engine),
+        "spots": partial(_alone, _take_spots, engine),
         "stop": partial(_stop, engine),
         "load": lambda fields: estimators.load(
             _text(fields, "source"), replace=bool(fields.get("replace", False))
         ),
         "unload": lambda fields: estimators.unload(_text(fields, "estimator")),
     }
+
+
+def _alone(
+    command: Callable[[Engine, dict[str, Any]], Mapping[str, object]], engine: Engine, fields: dict[str, Any]
+) -> Mapping[str, object]:
+    """Carry out a command while no other one changes settings or estimators."""
+    with engine.estimators.changing:
+        return command(engine, fields)
 
 
 def _set(engine: Engine, fields: dict[str, Any]) -> Mapping[str, object]:

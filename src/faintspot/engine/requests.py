@@ -226,8 +226,8 @@ def since(frame: int | None) -> str:
 class ControlServer(Closing):
     """Server that answers requests, each connection in a thread of its own, until closed.
 
-    Clients that hang, send garbage or disconnect neither stop the server nor delay others. Commands named in
-    `lengthy` run one after another; all others are answered meanwhile. Only the user can open the socket.
+    Clients that hang, send garbage or disconnect neither stop the server nor delay others. A command named in
+    `lengthy` waits for the same one only; all others are answered meanwhile, one after another. Only the user can open the socket.
 
     Parameters
     ----------
@@ -248,8 +248,8 @@ class ControlServer(Closing):
         self, path: str | Path, handlers: Mapping[str, Handler], lengthy: Collection[str] = ()
     ) -> None:
         self.path = Path(path)
-        self._handlers, self._lengthy = dict(handlers), frozenset(lengthy)
-        self._brief_one, self._lengthy_one = threading.Lock(), threading.Lock()
+        self._handlers, self._brief_one = dict(handlers), threading.Lock()
+        self._lengthy_ones = {command: threading.Lock() for command in lengthy}
         self._closing = False
         self._lock_file = locked_beside(self.path)
         try:
@@ -289,7 +289,7 @@ class ControlServer(Closing):
             if not isinstance(command, str) or command not in self._handlers:
                 commands = ", ".join(sorted(self._handlers))
                 raise InputError(f"command = {command!r:.80}: expected one of {commands}")
-            with self._lengthy_one if command in self._lengthy else self._brief_one:
+            with self._lengthy_ones.get(command, self._brief_one):
                 reply = _encoded({"ok": True, **self._handlers[command](fields)})
             if len(reply) > _LARGEST_REPLY:
                 raise InputError(f"reply: expected at most {_LARGEST_REPLY} bytes, got {len(reply)}")

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.stats import linregress
 from tests.slopes.wavefront.test_fit import LAYOUT, SCALED, slopes_of, slopes_of_modes
 
 from faintspot import InputError, Layout, Wavefront, fit_wavefront
@@ -39,6 +40,14 @@ def test_sizes_of_a_wavefront_without_noise() -> None:
     strehl = np.exp(-((2 * np.pi * found.rms_without_tilt.value / 4000.0) ** 2))
     assert found.strehl.value == pytest.approx(strehl)
     assert found.strehl.low < strehl < found.strehl.high
+
+
+def test_error_of_the_radius_of_curvature_is_its_scatter() -> None:
+    """Over 200 measurements, whose scatter is known to 5 %; three standard errors of that."""
+    defocus = np.array([noisy(SCALED, TRUE, 0.05, seed).mean[2] for seed in range(200)])
+    radii = 2.1**2 / (4 * np.sqrt(3) * 1e-9 * defocus)
+    stated = certify(noisy(SCALED, TRUE, 0.05, 0), draws=100).radius_of_curvature_m.standard_error
+    assert stated == pytest.approx(radii.std(), rel=0.15)
 
 
 def test_sizes_are_those_of_the_lit_part() -> None:
@@ -139,6 +148,15 @@ def test_drift_intervals_hold() -> None:
     scatter = np.std([found.mean for found in fits], axis=(0, 1))
     stated = np.sqrt(np.mean([found.standard_error**2 for found in fits], axis=(0, 1)))
     np.testing.assert_allclose(np.delete(stated, 4), np.delete(scatter, 4), rtol=0.15)
+
+
+def test_drift_and_its_error_are_those_of_a_line() -> None:
+    """Of few bins, where a degree of freedom counts: SciPy's regression of each mode, exactly."""
+    found = fit_drift(drifting(0.01, 1, 12), 4)
+    for number, values in enumerate(found.mean.T):
+        line = linregress(found.time, values)
+        assert found.rate[number] == pytest.approx(line.slope, rel=1e-9)
+        assert found.rate_standard_error[number] == pytest.approx(line.stderr, rel=1e-9)
 
 
 def test_drift_of_too_few_frames_is_refused() -> None:

@@ -83,7 +83,9 @@ def test_values_that_no_slope_has_count_as_not_measured(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("row", [None, np.zeros((2, 25)), np.zeros(49), "slopes", [[1.0], [2.0, 3.0]], 1j])
+@pytest.mark.parametrize(
+    "row", [None, np.zeros((2, 25)), np.zeros(49), "slopes", [[1.0], [2.0, 3.0]], 1j, np.full(50, 1j)]
+)
 def test_a_row_of_another_shape_is_one_line(control: PredictiveControl, row: Any) -> None:
     control.reset()
     for arguments in ((row,), (np.zeros(50), row)):
@@ -93,6 +95,13 @@ def test_a_row_of_another_shape_is_one_line(control: PredictiveControl, row: Any
             control(*arguments)
         assert "\n" not in str(caught.value)
     assert np.isfinite(control(np.zeros(50))).all()
+
+
+@pytest.mark.slow
+def test_masked_slopes_count_as_not_measured(control: PredictiveControl, recording: Recording) -> None:
+    rows = np.array(recording.slopes[:20])
+    rows[5:, 7] = np.nan
+    np.testing.assert_array_equal(commands(control, np.ma.masked_invalid(rows)), commands(control, rows))
 
 
 @pytest.mark.slow

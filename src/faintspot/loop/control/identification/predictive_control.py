@@ -305,7 +305,8 @@ class PredictiveControl:
         """
         scale = self._loop.scale
         try:
-            row = np.asarray(values, np.float64)
+            hides = np.ma.isMaskedArray(values) or np.iscomplexobj(values)
+            row = np.asarray(real_array(name, values) if hides else values, np.float64)
         except (TypeError, ValueError):
             row = real_array(name, values).astype(np.float64)
         if row.shape != scale.shape:
