@@ -227,7 +227,8 @@ class ControlServer(Closing):
     """Server that answers requests, each connection in a thread of its own, until closed.
 
     Clients that hang, send garbage or disconnect neither stop the server nor delay others. A command named in
-    `lengthy` waits for the same one only; all others are answered meanwhile, one after another. Only the user can open the socket.
+    `lengthy` waits for the same one only; all others are answered meanwhile, one after another. Only the user
+    can open the socket.
 
     Parameters
     ----------
