@@ -26,7 +26,7 @@ NEEDING = {
     "realtime run": "realtime",
     "realtime bridge stream": "realtime",
     "realtime record night.zarr": "realtime",
-    "export night.zarr -o night.fits": "realtime",
+    "export telemetry night.zarr -o night.fits": "realtime",
     "slopes frames.npy": "io",
     "slopes frames.npy -o slopes.fits": "io",
     "tune --read-noise-e 3 --pixels 16 --fwhm-px 1.8 --flux-e 100 -o new.toml --picture tune.png": "report",

@@ -16,7 +16,7 @@ from faintspot.base.errors import InputError, MissingExtraError
 _COMMANDS = {
     "demo": "Simulate a faint star, measure it with and without denoising, and write a report.",
     "estimators": "List the estimators, or the options of one.",
-    "export": "Write telemetry as FITS (AOT) for other software.",
+    "export": "Write telemetry as FITS (AOT), or a C library that measures slopes.",
     "layout": "Find the sub-apertures in a frame and write a configuration.",
     "live": "Show a running engine, or a recording, as a web page.",
     "loop": "Compare methods in a simulated closed loop, and recommend one.",
@@ -32,7 +32,6 @@ _COMMANDS = {
 
 _HOMES = {
     "estimators": "tune:list_estimators",
-    "export": "report:export",
     "live": "realtime.run:live",
     "loop": "study:loop_group",
 }

@@ -1,4 +1,4 @@
-"""faintspot report and export: a page of pictures and tables, and telemetry for other software."""
+"""faintspot report: a page of pictures and tables."""
 
 from pathlib import Path
 
@@ -67,32 +67,3 @@ def command(slopes: tuple[str, ...], output: str | None, recording: tuple[str, .
         report = report_of_stored(paths, frames=[Path(path) for path in recording] or None)
     report.write(target)
     click.echo(f"{target}: open it in a browser")
-
-
-@needs("realtime", "zarr", "aotpy")
-@click.command()
-@click.argument("telemetry", type=click.Path(path_type=Path))
-@option("--output", "-o", metavar="FITS", help="File to write.", show_default="TELEMETRY.fits")
-@option(
-    "--ao-mode",
-    type=click.Choice(["SCAO", "SLAO", "GLAO", "MOAO", "LTAO", "MCAO"]),
-    default="SCAO",
-    help="What an AOT file says the sensor serves.",
-)
-def export(telemetry: Path, output: str | None, ao_mode: str) -> None:
-    """Write telemetry as a file of the Adaptive Optics Telemetry standard (AOT).
-
-    TELEMETRY is what `faintspot realtime record` wrote.
-
-    \b
-    Example:
-      faintspot export night.zarr -o night.fits
-    """
-    from faintspot.io import read_telemetry, write_aot
-
-    out = Path(output or derived(telemetry, ".fits"))
-    if out.suffix != ".fits":
-        raise InputError(f"{out}: expected a name that ends in .fits")
-    recorded = read_telemetry(telemetry)
-    write_aot(out, recorded, ao_mode=ao_mode)
-    click.echo(f"{out}: {len(recorded.frame)} frames, {len(recorded.image_frame)} images")

@@ -39,7 +39,7 @@ def test_record_and_export(engine: Engine, tmp_path: Path, run: Commands) -> Non
     assert "(all that were asked for); nothing dropped" in text
     telemetry = read_telemetry(store)
     assert as_written(vars(telemetry))
-    text = run.ok("export", store, "-o", file, "--ao-mode", "GLAO").out
+    text = run.ok("export", "telemetry", store, "-o", file, "--ao-mode", "GLAO").out
     assert f"{file}: 50 frames, {len(telemetry.image_frame)} images" in text
     assert aotpy.AOSystem.read_from_file(file).ao_mode == "GLAO"
 
@@ -48,5 +48,5 @@ def test_what_cannot_be_done_is_said(engine: Engine, tmp_path: Path, run: Comman
     name, store = engine.ring.name, tmp_path / "a.zarr"
     run.refused("realtime", "record", tmp_path / "night", "--name", name, naming=("ends in .zarr",))
     run.refused("realtime", "record", store, "--name", f"{name}-other", naming=("start the engine first",))
-    run.refused("export", store, "-o", tmp_path / "b", naming=("ends in .fits",))
-    run.refused("export", store, naming=("no such file",))
+    run.refused("export", "telemetry", store, "-o", tmp_path / "b", naming=("ends in .fits",))
+    run.refused("export", "telemetry", store, naming=("no such file",))

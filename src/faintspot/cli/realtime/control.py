@@ -243,9 +243,9 @@ def _conditions_in_words(conditions: dict[str, Any]) -> str:
 def record(out: Path, name: str, frames: int | None, seconds: float | None) -> None:
     """Record slopes, fluxes, times, images and changes of settings of a running engine until Ctrl-C.
 
-    OUT is a Zarr store (.zarr), which grows as frames come and is whole at any time; `faintspot export` makes
-    an AOT file of it. The engine never waits: where reading or the disk is too slow, frames are lost to the
-    record, and counted.
+    OUT is a Zarr store (.zarr), which grows as frames come and is whole at any time;
+    `faintspot export telemetry` makes an AOT file of it. The engine never waits: where reading or the disk is
+    too slow, frames are lost to the record, and counted.
 
     \b
     Example:

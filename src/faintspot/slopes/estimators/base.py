@@ -9,6 +9,7 @@ from __future__ import annotations
 import enum
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Any, ClassVar, NamedTuple, Self
 
 import numpy as np
@@ -246,6 +247,8 @@ class EstimatorPlan:
     """Compiled function that measures the flux."""
     flux_step: float = 1.02
     """Measured flux is quantised in steps of this factor, so that settings change slowly."""
+    rows_of_options: Mapping[str, int] = MappingProxyType({})
+    """Rows of the settings table that hold an option as it is, on which nothing else depends."""
     prior_weight_row: int | None = None
     """Row of 1 / prior_std_px^2 in the settings table, for a prior whose width may change between frames."""
     in_python: bool = False

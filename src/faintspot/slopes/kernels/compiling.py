@@ -102,9 +102,14 @@ _KERNELS = Path(__file__).parent
 @cache
 def _kernels_stamp() -> tuple[tuple[float, int], ...]:
     """Return modification time and size of every source file that a kernel may inline."""
+    return tuple(_stamp(source) for source in kernel_sources())
+
+
+def kernel_sources(kernel: Any = None) -> list[Path]:
+    """Return every source file that kernels may inline, and those that this one depends on besides."""
     base = Path(checks.__file__).parent
-    sources = sorted([*_KERNELS.rglob("*.py"), base / "checks.py", base / "flags.py"])
-    return tuple(_stamp(source) for source in sources)
+    own = () if kernel is None else kernel._sources
+    return sorted([*_KERNELS.rglob("*.py"), base / "checks.py", base / "flags.py", *own])
 
 
 def _stamp(source: Path) -> tuple[float, int]:
@@ -225,7 +230,7 @@ class Direct:
     def __call__(self, *arguments: Any) -> Any:
         """Call the kernel."""
         if self._entry is None:
-            signature = tuple(_writable(self._kernel.typeof_pyval(argument)) for argument in arguments)
+            signature = tuple(writable_type(self._kernel.typeof_pyval(argument)) for argument in arguments)
             self._kernel.compile(signature)
             self._entry = self._kernel.overloads[signature].entry_point
         return self._entry(*arguments)
@@ -234,14 +239,14 @@ class Direct:
 types: Any = numba_types  # as far as mypy knows, a part of it is missing
 
 
-def _writable(kind: Any) -> Any:
-    """Return the type of arrays that may be written to, also within tuples."""
+def writable_type(kind: Any) -> Any:
+    """Return the type with arrays that may be written to, also within tuples."""
     if isinstance(kind, types.Array):
         return kind.copy(readonly=False)
     if isinstance(kind, types.BaseNamedTuple):
-        return types.NamedTuple([_writable(each) for each in kind], kind.instance_class)
+        return types.NamedTuple([writable_type(each) for each in kind], kind.instance_class)
     if isinstance(kind, types.BaseTuple):
-        return types.BaseTuple.from_types([_writable(each) for each in kind])
+        return types.BaseTuple.from_types([writable_type(each) for each in kind])
     return kind
 
 

@@ -27,6 +27,7 @@ from faintspot.slopes.estimators.centroid import RULES, most_kept, threshold_ran
 from faintspot.slopes.estimators.registry import register
 from faintspot.slopes.estimators.sensor import PIXEL_BLUR_PX2, Scene, Sensor
 from faintspot.slopes.kernels import gravity
+from faintspot.slopes.kernels.groups import RANGE
 
 Floats = NDArray[np.float64]
 
@@ -143,6 +144,9 @@ class GravityPlan(EstimatorPlan):
         self._keeping = estimator if isinstance(estimator, KeepingBrightest) else None
         automatic = self._keeping is not None and self._keeping.is_automatic
         self.needs_flux = automatic and bool(np.isnan(sensor.flux_e).all())
+        # An automatic number of kept pixels depends on the search range.
+        ranges = {} if automatic else {"search_range_px": RANGE}
+        self.rows_of_options = {"flux_floor": gravity.FLOOR, **ranges}
 
     def fill(self, table: NDArray[np.float32]) -> None:
         """See `EstimatorPlan`."""
@@ -237,6 +241,10 @@ _SMALLEST_E = 0.01
 
 class _ThresholdedPlan(GravityPlan):
     """Thresholds of a centre of gravity."""
+
+    def __init__(self, estimator: Centroid, sensor: Sensor) -> None:
+        super().__init__(estimator, sensor)
+        self.rows_of_options = {**self.rows_of_options, "threshold_e": gravity.LEVEL}
 
     def fill_flux(self, table: NDArray[np.float32], flux_e: Floats) -> None:
         """See `EstimatorPlan`."""

@@ -6,6 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
+from types import MappingProxyType
 from typing import Any, ClassVar, Self
 
 import numpy as np
@@ -88,6 +89,7 @@ class LikelihoodPlan(SpotPlan):
     """Tables of a weighted fit; pixels with low read noise are rounded to whole electrons."""
 
     kernel = staticmethod(spot_fits.fitted_of_groups)
+    rows_of_options: Mapping[str, int] = MappingProxyType({"model_error": spot_fits.MODEL_ERROR})
 
     estimator: Likelihood
 

@@ -19,7 +19,7 @@ from faintspot.slopes.estimators.base import BACKGROUND, CALIBRATED, RAW, Estima
 from faintspot.slopes.estimators.built_in.gravity import Floats, GravityPlan, KeepingBrightest
 from faintspot.slopes.estimators.noise import ALGORITHMS, suggested_strength, tv_denoise
 from faintspot.slopes.estimators.registry import register
-from faintspot.slopes.estimators.sensor import Scene
+from faintspot.slopes.estimators.sensor import Scene, Sensor
 from faintspot.slopes.kernels import gravity
 from faintspot.slopes.kernels.flat_start import flat_start_table
 
@@ -32,6 +32,11 @@ class _TotalVariationPlan(GravityPlan):
     """Strengths, and the starting point of the denoising."""
 
     estimator: TotalVariation
+
+    def __init__(self, estimator: TotalVariation, sensor: Sensor) -> None:
+        super().__init__(estimator, sensor)
+        limits = {"tolerance": gravity.TOLERANCE, "max_iterations": gravity.LIMIT}
+        self.rows_of_options = {**self.rows_of_options, "noise_std": gravity.STRENGTH, **limits}
 
     @cached_property
     def tables(self) -> gravity.GravityTables:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -18,6 +19,7 @@ from faintspot.slopes.estimators.registry import register
 from faintspot.slopes.estimators.sensor import Scene, Sensor
 from faintspot.slopes.estimators.spot_tables import gaussian_psf
 from faintspot.slopes.kernels import window
+from faintspot.slopes.kernels.groups import RANGE
 from faintspot.slopes.kernels.host import WIDTHS, lanes_for
 from faintspot.slopes.spots.fixed_weights import FixedWeights
 from faintspot.slopes.spots.shapes import FWHM_TO_STD
@@ -37,6 +39,7 @@ class _WindowPlan(EstimatorPlan):
     """Weights of each sub-aperture and the tables derived from them."""
 
     setting_rows = window.SETTING_ROWS
+    rows_of_options: Mapping[str, int] = MappingProxyType({"search_range_px": RANGE})
     own_scratch = staticmethod(window.no_scratch)
 
     estimator: Window
