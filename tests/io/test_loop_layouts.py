@@ -96,6 +96,27 @@ def test_numbers_and_times_that_do_not_rise(tmp_path: Path) -> None:
     assert [line.split(":")[0] for line in values["remarks"]] == ["times", "frame"]
 
 
+def test_rows_out_of_order_do_not_lose_the_times(tmp_path: Path) -> None:
+    """The times that are left belong to the frames that are left."""
+    path = loop_layouts.sparta(tmp_path, LOOP)
+    with fits.open(path) as file:
+        table = file[1].data
+        rows = np.r_[0:10, 8:20, 21, 20, 22:40]  # two repeated, two swapped
+        fits.HDUList([file[0], fits.BinTableHDU(table[rows], file[1].header)]).writeto(tmp_path / "t.fits")
+    values = read_layout(tmp_path / "t.fits", {})
+    kept = np.r_[0:20, 21:40]
+    np.testing.assert_array_equal(values["frame"], kept + LOOP.first)
+    np.testing.assert_allclose(values["time_s"] - START_S, kept / RATE_HZ, atol=2e-6)
+    assert len(values["slopes"]) == len(values["commands"]) == len(kept)
+
+
+@pytest.mark.parametrize(
+    ("state", "loop"), [("OFF", "open"), ("opened", "open"), (0.0, "open"), (1.0, "closed"), ("ON", "closed")]
+)
+def test_states_of_the_loop(tmp_path: Path, state: Any, loop: str) -> None:
+    assert read_layout(loop_layouts.sparta(tmp_path, LOOP, LOOP_ST=state), {})["loop"] == loop
+
+
 def test_tables_that_are_not_known(tmp_path: Path) -> None:
     path = table(tmp_path / "t.fits", WFS1_Gradients=LOOP.slopes, Volts=LOOP.commands)
     with refused("t.fits", "--slopes", "--commands", "WFS1_Gradients, Volts"):

@@ -144,7 +144,7 @@ def _report_loop(loop: Recording, page: Path, pieces: list[Piece]) -> LoopReport
         table = derived(page, "-over-time.csv")
         write_atomically(table, table_of_pieces(pieces))
         click.echo(table)
-    for line in filter(None, (*report.loop.remarks, report.advice)):
+    for line in filter(None, dict.fromkeys((*report.loop.remarks, *report.doubts, report.advice))):
         click.echo(line)
     click.echo(f"{page}: open it in a browser; {numbers} has the numbers")
     return report

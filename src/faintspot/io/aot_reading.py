@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from faintspot.base.checks import finite_array
 from faintspot.base.errors import InputError, MissingExtraError
 from faintspot.base.files import check_bytes, memory_bytes
-from faintspot.io.fits_units import AOT_VERSION, is_aot, units_of
+from faintspot.io.fits_units import AOT_VERSION, SIDE, is_aot, units_of
 from faintspot.io.stored_array import one_line
 
 _PIXELS = ("pix", "pixel", "px")
@@ -62,6 +62,8 @@ class AotSensor:
     diameter_m: float | None
     """Diameter of the telescope's pupil."""
     pixel_scale_arcsec: float | None
+    subaperture_m: float | None = None
+    """Side of a sub-aperture; in files of faintspot alone."""
     is_closed: bool = True
     """Whether the loop is closed that the sensor drives: the first one with commands, else the first one."""
     commands: NDArray[np.float64] | None = None
@@ -185,6 +187,7 @@ def _sensor(path: Path, sensor: Any, system: Any, loops: list[Any]) -> AotSensor
         _cells(sensor, n),
         _number(system.main_telescope, "enclosing_diameter"),
         None if scale is None else scale * 180 / np.pi * 3600,
+        next((float(item.value) for item in system.metadata if item.key == SIDE), None),
         **_loop(loops, n),
     )
 

@@ -5,7 +5,6 @@ slopes, fluxes, frames and times. It has none for the noise of slopes, flags, it
 configurations and denoised images: these stay in the Zarr store.
 """
 
-import warnings
 from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
@@ -18,22 +17,24 @@ from faintspot.base.checks import one_of
 from faintspot.base.errors import InputError, MissingExtraError
 from faintspot.base.files import write_atomically
 from faintspot.base.text_files import parse_text, to_json
+from faintspot.io.fits_units import SIDE
 from faintspot.io.telemetry import Telemetry
 
-# The standard demands both, which a sensor alone does not have.
-_EXPECTED = r".AOT_(WAVEFRONT_CORRECTORS|LOOPS). .* contains no data"
+_CLOSED = 2  # state of the loop
+_ARCSEC = np.pi / 180 / 3600
 AO_MODES = ("SCAO", "SLAO", "GLAO", "MOAO", "LTAO", "MCAO")
 
 
 def write_aot(path: str | Path, telemetry: Telemetry, *, ao_mode: str = "SCAO") -> None:
     """Write telemetry to an AOT file.
 
-    AOT demands a telescope, a source and a mode; the first two are written as names without data. Slopes are
-    `measurements` (t, 2, n), px, x and y, NaN where not valid. They were published with the reference
-    subtracted, which is stored as `ref_measurements`, px from the centre of each window. Fluxes are sums over
-    the sub-aperture in electrons after background subtraction; the standard has averages in ADU. The keyword
-    CONFIG holds the initial estimator and settings; CHG1, CHG2 and so on hold changes. There are no wavefront
-    correctors and loops, so that aotpy warns when it reads the file. All data are in memory at once.
+    AOT demands a telescope, a source and a mode; the first two are names, with the diameter if it is known.
+    Slopes are `measurements` (t, 2, n), px, x and y, NaN where not valid. They were published with the
+    reference subtracted, which is stored as `ref_measurements`, px from the centre of each window. Fluxes
+    are sums over the sub-aperture in electrons after background subtraction; the standard has averages in
+    ADU. The keyword CONFIG holds the initial estimator and settings; CHG1, CHG2 and so on hold changes. The
+    loop has its commands and says whether it was ever closed; its interaction matrix is not written. All
+    data are in memory at once.
 
     Parameters
     ----------
@@ -66,9 +67,7 @@ def write_aot(path: str | Path, telemetry: Telemetry, *, ao_mode: str = "SCAO") 
         raise InputError("telemetry: expected at least one frame, got none")
     if target.exists():
         raise InputError(f"{target}: already exists; choose another name")
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", _EXPECTED)
-        file = AOTFITSWriter(_system(telemetry, ao_mode)).get_hdulist()
+    file = AOTFITSWriter(_system(telemetry, ao_mode)).get_hdulist()
     write_atomically(target, file.writeto)
 
 
@@ -80,15 +79,28 @@ def _system(telemetry: Telemetry, ao_mode: str) -> Any:
     attributes = telemetry.attributes
     tables = parse_text(attributes["settings"], "settings of the recording")
     source = aotpy.NaturalGuideStar("SOURCE")
+    telescope = aotpy.MainTelescope("TELESCOPE", enclosing_diameter=attributes["layout"].get("diameter_m"))
+    sensor = _sensor(telemetry, source, tables.get("estimator", {}).get("name"))
+    commands = telemetry.commands.shape[1]
+    mirror = aotpy.DeformableMirror("MIRROR", n_valid_actuators=max(commands, 1), telescope=telescope)
+    loop = aotpy.ControlLoop(
+        "LOOP",
+        commanded_corrector=mirror,
+        input_sensor=sensor,
+        closed=bool((np.asarray(telemetry.loop) == _CLOSED).any()),
+        commands=aotpy.Image("COMMANDS", np.asarray(telemetry.commands)) if commands else None,
+    )
     return aotpy.AOSystem(
         ao_mode=ao_mode,
         name=str(attributes["name"]),
         date_beginning=datetime.fromtimestamp(unix[0], UTC),
         date_end=datetime.fromtimestamp(unix[-1], UTC),
         config=to_json(tables),
-        main_telescope=aotpy.MainTelescope("TELESCOPE"),
+        main_telescope=telescope,
         sources=[source],
-        wavefront_sensors=[_sensor(telemetry, source, tables.get("estimator", {}).get("name"))],
+        wavefront_sensors=[sensor],
+        wavefront_correctors=[mirror],
+        loops=[loop],
         metadata=_metadata(telemetry),
     )
 
@@ -97,11 +109,13 @@ def _metadata(telemetry: Telemetry) -> list[Any]:
     """Return keywords for data that have no field in AOT."""
     from aotpy import Metadatum
 
+    side = telemetry.attributes["layout"].get("subaperture_m")
     dropped = int(telemetry.attributes["dropped_records"])
     return [
         Metadatum("ORIGIN", "faintspot"),
         Metadatum("DROPPED", dropped, "frames measured, lost by the recorder"),
         Metadatum("METHODS", ", ".join(telemetry.attributes["methods"]), "interleaved settings"),
+        *([] if side is None else [Metadatum(SIDE, float(side), "m, side of a sub-aperture")]),
         *(Metadatum(f"CHG{i}", to_json(change)) for i, change in enumerate(telemetry.changes, 1)),
     ]
 
@@ -161,7 +175,8 @@ def _detector(telemetry: Telemetry) -> object:
     """Return the detector with the recorded frames."""
     import aotpy
 
-    detector = aotpy.Detector(uid="DETECTOR")
+    scale = telemetry.attributes["layout"].get("pixel_scale_arcsec")
+    detector = aotpy.Detector(uid="DETECTOR", pixel_scale=None if scale is None else scale * _ARCSEC)
     if len(telemetry.image_frame):
         numbers, rows = np.unique(telemetry.frame, return_index=True)
         nearest = np.minimum(np.searchsorted(numbers, telemetry.image_frame), len(numbers) - 1)

@@ -101,6 +101,8 @@ class StreamedArray:
 
 AOT_VERSION = "AOT-VERS"
 """Keyword in the primary header of a file of the Adaptive Optics Telemetry standard."""
+SIDE = "SUBAPM"
+"""Keyword of faintspot for the side of a sub-aperture, m."""
 
 
 @dataclass(frozen=True)

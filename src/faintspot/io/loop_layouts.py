@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from fnmatch import fnmatchcase
 from itertools import zip_longest
@@ -140,7 +141,7 @@ LAYOUTS: tuple[TelemetryLayout, ...] = (
 _TABLES = (".fits.gz", ".fits", ".sav")
 _ENDINGS = (*_TABLES, ".fits.fz", ".npy", *TEXTS)
 _MOST_FILES = 1 << 14
-_OPEN = ("F", "FALSE", "OPEN", "0")
+_OPEN = ("F", "FALSE", "NO", "OFF", "OPEN", "OPENED")
 
 Names = Mapping[str, str]  # locations for `read_array`, by the names of arrays
 
@@ -266,6 +267,18 @@ def _located(path: Path, names: Names, text: str) -> str:
     return f"{path}:{text}"
 
 
+def _rising(frame: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Return the rows whose frame number is larger than all before."""
+    return np.append(True, frame[1:] > np.maximum.accumulate(frame)[:-1])
+
+
+def _is_open(state: str) -> bool:
+    """Return whether the state of a loop in a header, a word or a number, is that of an open one."""
+    with suppress(ValueError):
+        return float(state) == 0.0
+    return state.strip().upper() in _OPEN
+
+
 class _Reader:
     """Reader of one loop."""
 
@@ -280,17 +293,23 @@ class _Reader:
     def values(self) -> dict[str, Any]:
         """Return the quantities; see `read_layout`."""
         layout = self._layout
-        slopes = self._side_by_side("slopes", layout.slopes)[:, slice(*layout.columns)]
-        values = {**layout.known, "slopes": slopes, **self._commands(slopes.shape[1]), **self._timing()}
+        if len(layout.slopes) == 1:  # perhaps (frames, n, 2)
+            slopes = self._read("slopes", _find(self._names, layout.slopes[0]))
+        else:
+            slopes = self._side_by_side("slopes", layout.slopes)
+        if slopes.ndim == 2:
+            slopes = slopes[:, slice(*layout.columns)]
+        commands = self._commands(slopes.size // max(len(slopes), 1))
+        values = {**layout.known, "slopes": slopes, **commands, **self._timing()}
         if cells := _find(self._all, layout.cells):
             values["cells"] = self._read("cells", cells)
         if (state := self._stated(layout.closed)) is not None:
-            values["loop"] = "open" if str(state).strip().upper() in _OPEN else "closed"
+            values["loop"] = "open" if _is_open(str(state)) else "closed"
         if (law := self._stated(layout.law)) is not None:
             values["control_law"] = f"{layout.law} = {law}"
         frame = values.get("frame", ())
         if len(frame) == len(slopes):
-            kept = np.append(True, frame[1:] > np.maximum.accumulate(frame)[:-1])
+            kept = _rising(frame)
             if not kept.all():
                 count = np.count_nonzero(~kept)
                 self._remarks.append(f"frame: left out {count} rows whose number does not rise")
@@ -365,7 +384,8 @@ class _Reader:
         if parts.shape[1] != len(units):
             raise InputError(f"{self._sources['time_s']}: expected a number for each frame, got more")
         time_s = parts @ list(units.values())
-        if (np.diff(time_s) > 0).all():
+        frames = values.get("frame", ())
+        if (np.diff(time_s[_rising(frames)] if len(frames) == len(time_s) else time_s) > 0).all():
             return {**values, "time_s": time_s}
         if names := self._sources.pop("time_s", ""):
             self._remarks.append(f"times: {names} do not rise, so they are not used")

@@ -28,7 +28,7 @@ class Stream(NamedTuple):
     """Frames of a stream."""
 
     frames: NDArray[Any]
-    """(frames, values)"""
+    """(frames, ...)"""
     number: NDArray[np.int64]
     time_s: NDArray[np.float64]
 
@@ -75,7 +75,8 @@ def read_streams(path: Path, named: Mapping[str, str]) -> dict[str, Any]:
             raise InputError(
                 f"{path}: expected commands at the times of slopes, got {len(sent)}; name others"
             )
-        values["commands"], sources["commands"] = commands.frames[sent], named["commands"]
+        sent_rows = commands.frames[sent]
+        values["commands"], sources["commands"] = sent_rows.reshape(len(sent), -1), named["commands"]
     number = slopes.number[rows]
     values |= {"slopes": slopes.frames[rows], "frame": number - number[0], "time_s": slopes.time_s[rows]}
     arrays = {name: text for name, text in named.items() if name not in ("slopes", "commands")}
@@ -128,8 +129,8 @@ def _read(path: Path, streams: Mapping[str, list[Path]], name: str) -> Stream:
         check_bytes(cube, total, memory_bytes() // 4, "streams")
         rising = bool((np.diff(timing[:, _ACQUIRED]) > 0).all())
         time_s = timing[:, _ACQUIRED if rising else _LOGGED].astype(np.float64)
-        parts.append(Stream(frames.reshape(len(frames), -1), timing[:, _COUNTER].astype(np.int64), time_s))
-    if len({part.frames.shape[1] for part in parts}) > 1:
+        parts.append(Stream(frames, timing[:, _COUNTER].astype(np.int64), time_s))
+    if len({part.frames.shape[1:] for part in parts}) > 1:
         raise InputError(f"{name}: expected cubes of frames of one size, got several")
     parts.sort(key=lambda part: float(part.time_s[0]))
     frames, number, time_s = (np.concatenate(values) for values in zip(*parts, strict=True))
@@ -196,7 +197,7 @@ def read_session(path: Path) -> dict[str, Any]:
     if len(frame) < 2:
         raise InputError(f"{path}: expected frames that signal and wfc have in common, got {len(frame)}")
     return {
-        "slopes": slopes[first].reshape(len(frame), -1),
+        "slopes": slopes[first],
         "commands": commands[second].reshape(len(frame), -1),
         "frame": (frame - frame[0]).astype(np.int64),
         "time_s": times[first],

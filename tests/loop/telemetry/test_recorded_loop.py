@@ -8,12 +8,15 @@ import numpy as np
 import pytest
 from tests.cli.cli_cases import Commands
 from tests.io import loop_layouts
+from tests.io.telemetry_files import ATTRIBUTES, IMAGE, RECORD, SIZES, images_of, records_of
 from tests.loop.telemetry.loop_cases import CELLS, recorded
 
 import faintspot as fs
 from faintspot.base.errors import InputError
 from faintspot.base.flags import SubapertureFlag
-from faintspot.io import create_writer
+from faintspot.engine.telemetry.recorder import TelemetryStore
+from faintspot.io import create_writer, read_telemetry, write_aot
+from faintspot.io.telemetry import item_type
 from faintspot.loop.control.identification.recording import NUMBERS, Recording, prepared
 from faintspot.loop.telemetry.page import page_of_loop
 from faintspot.loop.telemetry.recorded_loop import frame_rate, read_recorded_loop
@@ -92,6 +95,30 @@ def test_control_matrix_and_mask(tmp_path: Path) -> None:
     assert loop.interaction_matrix.shape == (50, 36)
     assert np.array_equal(loop.cells, CELLS + 1)
     assert loop.pixel_scale_arcsec == 1.0
+
+
+@pytest.mark.parametrize("closed", [True, False])
+def test_what_is_written_as_aot_is_read_as_from_the_store(tmp_path: Path, closed: bool) -> None:
+    pytest.importorskip("aotpy")
+    scales = {"pixel_scale_arcsec": 0.3, "subaperture_m": 0.5, "diameter_m": 1.6}
+    records = np.zeros(15, item_type("frame", {**SIZES, "command": 4}, ()))
+    for name in RECORD.names or ():
+        records[name] = records_of(10, 15)[name]
+    records["loop"], records["flags"] = 1 + closed, 0
+    records["commands"] = np.arange(60).reshape(15, 4)
+    attributes = {**ATTRIBUTES, "layout": ATTRIBUTES["layout"] | scales}
+    store = TelemetryStore(tmp_path / "night.zarr", records.dtype, IMAGE, attributes)
+    store.append(records, images_of(10), {})
+    write_aot(tmp_path / "night.fits", read_telemetry(store.path))
+    known = {"frame_rate_hz": 1000.0}
+    loops: list[Any] = [
+        read_recorded_loop(tmp_path / name, stated=known) for name in ("night.zarr", "night.fits")
+    ]
+    for name in ("slopes", "commands", "cells", "frame"):
+        np.testing.assert_allclose(getattr(loops[1], name), getattr(loops[0], name), err_msg=name)
+    for name in ("is_closed", "slope_unit", "subaperture_m"):
+        assert getattr(loops[1], name) == getattr(loops[0], name)
+    assert loops[1].pixel_scale_arcsec == pytest.approx(0.3)
 
 
 def test_aot_file_is_read(tmp_path: Path) -> None:
@@ -322,6 +349,17 @@ def test_tip_tilt_of_keck(tmp_path: Path) -> None:
     delay = report_of_loop(loop, compare=False).parts["loop"].values[0]
     assert delay.value == pytest.approx(2.0, abs=3 * delay.error)
     assert 0 < delay.error < 0.2
+
+
+@pytest.mark.parametrize("order", ["axes", "pairs"])
+def test_slopes_of_a_folder_in_three_dimensions(tmp_path: Path, order: str) -> None:
+    """(frames, n, 2) says itself which is x; the order is that of flat rows."""
+    slopes = np.random.default_rng(1).standard_normal((30, 9, 2))
+    np.save(tmp_path / "slopes.npy", slopes)
+    stated: dict[str, float | str] = {"slope_unit": "px", "frame_rate_hz": 100.0, "loop": "open"}
+    stated["slope_order"] = order
+    loop: Any = read_recorded_loop(tmp_path, stated=stated)
+    np.testing.assert_array_equal(loop.slopes, np.hstack([slopes[..., 0], slopes[..., 1]]))
 
 
 def test_sensor_without_cells(tmp_path: Path) -> None:

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.loop.control.flattening import residual_phase
-from faintspot.loop.control.identification.open_loop import noise_variance
+from faintspot.loop.control.identification.slope_noise import SlopeNoise, noise_of_slopes
 from faintspot.loop.control.reconstructor import make_reconstructor
 from faintspot.loop.slope_covariance import ARCSEC, SlopeTurbulence
 from faintspot.loop.telemetry.recorded_loop import frame_rate
@@ -25,8 +25,6 @@ Floats = NDArray[np.float64]
 FEWEST_SCORED = 5
 """Frames of a turn after settling, of which a residual phase is computed."""
 _FEWEST_MEASURED = 0.5  # of a frame's slopes, for the frame to count
-_PARABOLA = 2  # frames on each side
-_NOISE_ERROR = 2.5  # of Gaussian noise times its deviation from a parabola: variance in units of its square
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,11 +142,11 @@ def phase_of_turn(loop: AlternatingLoop, turn: Turn, gain: float) -> TurnPhase |
     """
     rows = np.arange(turn.begin, turn.end)
     residual = loop.slopes_px[rows].astype(np.float64) / gain
-    variance, count = _noise(residual - loop.mirror(rows), loop.frame[rows])
+    variance, error, shared_error = _noise(residual - loop.mirror(rows), loop.frame[rows])
     scored = residual[turn.scored - turn.begin :]
     share = np.isfinite(scored).mean(axis=1)
     usable = share >= _FEWEST_MEASURED
-    if np.count_nonzero(usable) < FEWEST_SCORED or not (count > 0).any():
+    if np.count_nonzero(usable) < FEWEST_SCORED or not np.isfinite(error).any():
         return None
     phase = np.nan_to_num(scored[usable]) @ loop.phase.T
     frames = len(phase)
@@ -158,7 +156,8 @@ def phase_of_turn(loop: AlternatingLoop, turn: Turn, gain: float) -> TurnPhase |
     squared = float(np.square(noise).sum())
     residual_m2 = mean - float(weight @ variance)
     of_frames = 2 * squared + 4 * max(residual_m2, 0.0) * squared / max(float(np.trace(noise)), 1e-300)
-    of_noise = float(np.square(weight * variance) @ (_NOISE_ERROR / np.maximum(count, 1)))
+    of_noise = float(np.square(weight * variance) @ np.square(np.nan_to_num(error)))
+    of_noise += (float(np.nan_to_num(shared_error)) * float(weight @ variance)) ** 2
     return TurnPhase(residual_m2, math.sqrt(of_frames / frames + of_noise))
 
 
@@ -186,13 +185,11 @@ def open_loop_slopes(
     return centred[0], centred[1], np.concatenate(run)
 
 
-def _noise(open_loop: Floats, frame: NDArray[np.int64]) -> tuple[Floats, Floats]:
-    """Return the variance of the slopes' noise in a turn, and the number of frames that it is from."""
+def _noise(open_loop: Floats, frame: NDArray[np.int64]) -> SlopeNoise:
+    """Return the noise of the slopes in a turn."""
     grid = np.full((int(frame[-1] - frame[0]) + 1, open_loop.shape[1]), np.nan)
-    if len(grid) <= 2 * _PARABOLA:
-        return np.zeros(open_loop.shape[1]), np.zeros(open_loop.shape[1])
     grid[frame - frame[0]] = open_loop
-    return noise_variance(grid)
+    return noise_of_slopes(grid)
 
 
 _FRAMES_BEFORE = 2

@@ -122,6 +122,8 @@ def page_of_loop(report: LoopReport, pieces: Sequence[Piece] = ()) -> Report:
         "choices": _choices_table(report),
     }
     for name, part in report.parts.items():
+        if name == "loop" and not part.values:  # of an open loop
+            continue
         sections.append(_TEXT.section(name, _table(part), more.get(name), missing=part.missing))
     without_cells = loop.cells is None
     size = {"Slopes": loop.slopes.shape[1]} if without_cells else {"Sub-apertures": len(loop.cells)}
@@ -129,8 +131,8 @@ def page_of_loop(report: LoopReport, pieces: Sequence[Piece] = ()) -> Report:
         f"{'Loop' if loop.is_closed else 'Turbulence'} of {loop.name}",
         {**{name: f"{n}" for name, n in size.items()}, "Frame rate": f"{loop.frame_rate_hz:.6g} Hz"},
         sections,
-        [report.advice] if report.advice else [],
-        warnings_title="What to do",
+        report.doubts or list(filter(None, [report.advice])),
+        warnings_title=_TEXT["doubts.title" if report.doubts else "advice"],
         remark=_TEXT["remark"],
     )
 

@@ -23,7 +23,7 @@ from faintspot.io.slopes import holds_slopes
 from faintspot.io.telemetry import read_telemetry
 from faintspot.io.zarr_store import holds_telemetry
 from faintspot.loop.control.configuration import RecordedControl, load_control, unpacked_control
-from faintspot.loop.control.identification.recording import NUMBERS, Recording, cells_of
+from faintspot.loop.control.identification.recording import NUMBERS, Recording, cells_of, rows_of_slopes
 from faintspot.loop.slope_covariance import ARCSEC
 from faintspot.loop.telemetry.recording import CLOSED
 from faintspot.slopes.recorded.stored_run import open_run
@@ -36,7 +36,7 @@ UNITS = {"px": None, "arcsec": 1.0, "rad": 1 / ARCSEC}
 _OF_AOT = {"pix": "px", "pixel": "px", "px": "px", "arcsec": "arcsec", "rad": "rad"}
 _ARRAYS = ("slopes", "commands", "interaction_matrix", "control_matrix", "cells", "time_s", "frame", "flags")
 _OF_SENSOR = (
-    *("frame", "cells", "diameter_m", "pixel_scale_arcsec"),
+    *("frame", "cells", "diameter_m", "pixel_scale_arcsec", "subaperture_m"),
     *("commands", "control_matrix", "frame_rate_hz", "delay_frames"),
 )
 _SCALES = ("pixel_scale_arcsec", "subaperture_m", "diameter_m")
@@ -262,6 +262,8 @@ def _loop(name: str, values: dict[str, Any], given: list[str]) -> Recording:
     slopes = real_array("slopes", values["slopes"], minimum_dimensions=1).astype(np.float64)
     remarks = [_taken(values, given), *values.get("remarks", ())]
     in_pairs = one_of("slope_order", values.get("slope_order", _AXES), _ORDERS) == _PAIRS
+    if 2 not in slopes.shape[1:]:  # an image of one row, or a column
+        slopes = rows_of_slopes(slopes)
     if in_pairs and slopes.ndim == 2:
         slopes = np.hstack([slopes[:, ::2], slopes[:, 1::2]])
     numbers = _numbers(values)

@@ -25,7 +25,7 @@ from faintspot.loop.control.identification.open_loop import (
     site_of_loop,
     with_axes_of,
 )
-from faintspot.loop.control.identification.recording import Recording, prepared
+from faintspot.loop.control.identification.recording import Recording, order_doubt, prepared
 from faintspot.loop.slope_covariance import ARCSEC
 from faintspot.loop.telemetry.spectra import (
     ModalSpectra,
@@ -47,7 +47,7 @@ _PARTS = ("frames", "loop", "noise", "turbulence", "vibrations", "spectra", "cho
 _OF_TURBULENCE = _PARTS[3:]
 _TIMES_AT_LIMIT = 3  # that a largest value occurs, to be taken for a limit
 _MOST_UNMEASURED = 0.2  # of the slopes; large ones are missed most, so that the others vary too little
-_PARABOLA_ERROR = 0.03  # of the noise: turbulence and speckles within two frames are no parabola
+_INDISTINCT = 0.5  # relative error of the noise, from which it may be turbulence
 
 
 @dataclass
@@ -76,6 +76,8 @@ class LoopReport:
     """Delay and centroid gain that were measured and are used."""
     observed: ObservedLoop | None = None
     """From which a controller can be learnt; None if delay or turbulence are unknown."""
+    doubts: list[str] = field(default_factory=list)
+    """Reasons not to trust the numbers; then there is no advice."""
 
     def lack(self, reason: str, names: Sequence[str] = _OF_TURBULENCE) -> None:
         """State why parts have no values, unless a reason is stated already."""
@@ -84,8 +86,8 @@ class LoopReport:
 
     @property
     def advice(self) -> str:
-        """Recommendation in one sentence; empty if no control was compared."""
-        if not self.choices:
+        """Recommendation in one sentence; empty if no control was compared, or the data are doubtful."""
+        if not self.choices or self.doubts:
             return ""
         from faintspot.loop.telemetry.choices import advice  # with all filters
 
@@ -111,6 +113,7 @@ class LoopReport:
             "recording": self.loop.name,
             "slope_unit": self.loop.slope_unit,
             "remarks": list(self.loop.remarks),
+            "doubts": self.doubts,
             "advice": self.advice,
             **values,
         }
@@ -138,6 +141,7 @@ def report_of_loop(
     parts = {name: Part(_TEXT[f"{name}.title"]) for name in _PARTS}
     remarks = (*loop.remarks, *ready.recording.remarks)
     report = LoopReport(replace(ready.recording, remarks=remarks), parts)
+    report.doubts += filter(None, [order_doubt(ready.recording)])
     _frames(report)
     progress("delay")
     delay = _loop(report)
@@ -165,18 +169,21 @@ def _frames(report: LoopReport) -> None:
         Measured("duration", "s", float(span), 0.0),
         Measured("lost frames", "", float(lost.sum()), 0.0, f"in {np.count_nonzero(lost)} gaps"),
         Measured("longest gap", "frames", float(lost.max(initial=0)), 0.0),
-        Measured("slopes not measured", "", float(np.isnan(loop.slopes).mean()), 0.0, "share"),
+        Measured("slopes not measured", "%", round(100 * float(np.isnan(loop.slopes).mean()), 2), 0.0),
     ]
+    missing = 1 - np.isfinite(loop.slopes).any(axis=1).sum() / (loop.frame[-1] - loop.frame[0] + 1)
+    if missing > _MOST_UNMEASURED:
+        report.doubts.append(_TEXT("doubts.missing", share=missing))
 
 
 def _loop(report: LoopReport) -> LoopDelay:
     """Return delay and gain; without commands those of an open loop."""
     loop, part = report.loop, report.parts["loop"]
-    part.values.append(_saturated(loop))
     is_still = loop.commands is None or not np.ptp(loop.commands, axis=0).any()
     if not loop.is_closed or (is_still and loop.commands is not None):
         part.missing = "The loop was open: it has no delay and no gain to measure."
         return LoopDelay(1.0, 0.0, 1.0, loop.gain_error or 0.0)
+    part.values.append(_saturated(loop))
     if loop.commands is None or loop.interaction_matrix is None:
         absent = "commands" if loop.commands is None else "an interaction or control matrix"
         why = f"The recording has no {absent}: its open-loop slopes are unknown."
@@ -197,6 +204,7 @@ def _delay(report: LoopReport) -> tuple[list[Measured], LoopDelay]:
             fitted = modes_of(loop).recording
     fit, used, unknown = known_delay(fitted)
     if unknown:
+        report.doubts.append(_TEXT["doubts.delay"])
         remarks = f"{unknown}; {used.delay_frames:g} is used", f"{unknown}; 1 is used"
         return [Measured(*name, remark=text) for name, text in zip(names, remarks, strict=True)], used
     remark = "given" if assumed is not None else f"{used.delay_frames:g} is used" if used is not fit else ""
@@ -239,6 +247,8 @@ def _noise(report: LoopReport, delay: LoopDelay) -> OpenLoop | None:
         report.lack(f"{error}.", ("noise", *_OF_TURBULENCE))
         return None
     known = np.isfinite(open_loop.variance_error)
+    if not known.any() or not open_loop.shared_error < 2 * _INDISTINCT:
+        report.doubts.append(_TEXT["doubts.noise"])
     if not known.any():
         part.missing = "No slope was measured in five consecutive frames."
         return open_loop
@@ -246,8 +256,8 @@ def _noise(report: LoopReport, delay: LoopDelay) -> OpenLoop | None:
     report.noise_px = np.where(known, loop.unit * gains * np.sqrt(open_loop.variance), np.nan)
     report.noise_error_px = 0.5 * report.noise_px * open_loop.variance_error
     rms = float(np.sqrt(np.square(report.noise_px[known]).mean()))
-    spread = 0.5 * rms * float(open_loop.variance_error[known].mean()) / math.sqrt(known.sum())
-    spread = math.hypot(spread, _PARABOLA_ERROR * rms)
+    of_each = float(open_loop.variance_error[known].mean()) / math.sqrt(known.sum())
+    spread = 0.5 * rms * math.hypot(of_each, open_loop.shared_error)
     of_spectra = "rms over the slopes, from where their spectra are flat"
     remark = of_spectra if loop.cells is None else "rms over the sub-apertures"
     part.values.append(Measured("noise of a slope", loop.slope_unit, rms, spread, remark))
@@ -288,6 +298,8 @@ def _turbulence(report: LoopReport, open_loop: OpenLoop, delay: LoopDelay) -> Id
         return identification
     strength = measured_strength(loop, open_loop, delay, replace(identified.turbulence, r0_m=site.r0_m))
     part.values += strength
+    if not any(value.name == R0 and math.isfinite(value.value) for value in strength):
+        report.doubts.append(_TEXT["doubts.turbulence"])
     if not math.isfinite(strength[0].value) and len(strength) == 1:
         return identification
     part.values += measured_winds(identified, next(value for value in strength if value.name == R0))

@@ -8,7 +8,12 @@ from tests.loop.telemetry.loop_cases import AIR, recorded
 
 from faintspot.base.errors import InputError
 from faintspot.loop.control.identification.layers import Identified
-from faintspot.loop.control.identification.open_loop import measured_delay, site_of_loop, winds_of
+from faintspot.loop.control.identification.open_loop import (
+    measured_delay,
+    open_loop_of,
+    site_of_loop,
+    winds_of,
+)
 from faintspot.loop.control.identification.recording import Recording
 
 
@@ -34,6 +39,18 @@ def test_frames_without_slopes_are_gaps() -> None:
     slopes[:] = np.nan
     with pytest.raises(InputError, match="expected frames with most slopes measured"):
         measured_delay(replace(loop, slopes=slopes))
+
+
+def test_lost_frames_here_and_there_change_neither_delay_nor_gain() -> None:
+    """Of every 20 frames one is lost, and numbered; true are 2 frames and a gain of 1."""
+    loop = recorded()
+    kept = np.ones(len(loop.slopes), np.bool_)
+    kept[np.random.default_rng(1).permutation(len(kept))[: len(kept) // 20]] = False
+    whole, _ = measured_delay(loop)
+    found, used = measured_delay(loop.part(kept))
+    assert found.delay_frames == pytest.approx(2, abs=0.2)
+    assert found.gain == pytest.approx(whole.gain, abs=0.06)
+    assert open_loop_of(loop.part(kept), used).telemetry.trust.any(axis=1).mean() > 0.88
 
 
 def test_infinite_slopes_count_as_not_measured() -> None:

@@ -27,6 +27,7 @@ from faintspot.loop.control.identification.loop_delay import (
     cross_spectra,
 )
 from faintspot.loop.control.identification.recording import Recording
+from faintspot.loop.control.identification.slope_noise import SlopeNoise
 from faintspot.loop.control.identification.vibrations import Vibration
 from faintspot.loop.control.reconstructor import check_controllable
 
@@ -225,6 +226,10 @@ LEAST_MEASURED = 0.5
 _SHORTEST, _LONGEST = 64, 4096  # frames of a piece
 _PIECES = 6
 _PLATEAU = 0.35  # cycles a frame, above which a spectrum is noise
+_OF_MEDIAN, _NOT_FLAT = (
+    2.5,
+    0.06,
+)  # variance of the noise in units of its square / frames; error where not flat
 _LEAST_NOISE = 1e-6  # of the variance of a mode
 
 
@@ -257,15 +262,17 @@ def modes_of(loop: Recording) -> Modes:
     return Modes(replace(loop, slopes=modes, interaction_matrix=analysis @ matrix, **unknown), analysis)
 
 
-def plateau(modes: Floats) -> tuple[Floats, Floats]:
-    """Return the variance of each mode's noise, from where its spectrum is flat, and frames that it is from.
+def plateau(modes: Floats) -> SlopeNoise:
+    """Return the noise of each mode, from where its spectrum is flat.
 
     Parameters
     ----------
     modes : (frames, k) array
         Open-loop modes; NaN where not measured.
     """
-    return spectra_of_modes(modes)[1], (1 - 2 * _PLATEAU) * np.isfinite(modes).sum(axis=0)
+    count = (1 - 2 * _PLATEAU) * np.isfinite(modes).sum(axis=0)
+    error = np.where(count > 0, np.sqrt(_OF_MEDIAN / np.maximum(count, 1)), np.nan)
+    return SlopeNoise(spectra_of_modes(modes)[1], error, _NOT_FLAT)
 
 
 def spectra_of_modes(modes: Floats, without: slice = slice(0)) -> tuple[Floats, Floats]:

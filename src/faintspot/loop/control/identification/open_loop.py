@@ -14,7 +14,6 @@ from faintspot.base.errors import InputError
 from faintspot.loop.control.base import OpenLoopTelemetry
 from faintspot.loop.control.identification.layers import Identified
 from faintspot.loop.control.identification.loop_delay import (
-    FEWEST_SUBAPERTURES,
     GAINS,
     DelayFits,
     LoopDelay,
@@ -22,6 +21,7 @@ from faintspot.loop.control.identification.loop_delay import (
 )
 from faintspot.loop.control.identification.modal_delay import ModalFits, plateau
 from faintspot.loop.control.identification.recording import Recording
+from faintspot.loop.control.identification.slope_noise import noise_of_slopes
 from faintspot.loop.slope_covariance import OUTER_SCALE_M, SlopeTurbulence
 from faintspot.loop.turbulence_strength import TurbulenceStrength
 
@@ -29,6 +29,7 @@ Floats = NDArray[np.float64]
 
 FEWEST_FRAMES = 200
 _MOST_LOST = 0.3  # of the frames; with more, the longest run without a gap is used
+_SHORT_GAP, _MOST_FILLED = 3, 0.1  # frames that are interpolated for delay and gain, and part of all
 _WHOLE_FRAMES = 0.1  # closer to a whole number of frames than this, a delay is taken for that
 _LEAST_MEASURED = 0.5  # of a frame's slopes: the others count as 0 for delay and gain
 _LEAST_SIGNAL = 1e-6  # of the slopes' variance, that their noise is taken to have
@@ -47,6 +48,8 @@ class OpenLoop:
     """(2 n,): variance of the noise; of known standard errors the median."""
     variance_error: Floats
     """(2 n,): relative standard error of the measured variance; NaN where it is unknown."""
+    shared_error: float
+    """Relative standard error that all of these share."""
 
     def scaled(self, gain: float) -> OpenLoop:
         """Return the same with residual slopes multiplied by a gain."""
@@ -121,13 +124,32 @@ def _of_fit(loop: Recording) -> tuple[Floats, Floats, NDArray[np.int64], SlopeTu
     slopes = np.nan_to_num(loop.slopes[rows][:, columns])
     mirror = loop.commands[rows] @ loop.interaction_matrix[columns].T
     site = replace(site, positions_m=site.positions_m[kept])
-    return slopes, mirror, runs_of(loop.frame[rows]), site, loop.frame_rate_hz
+    return *_filled(loop.frame[rows], slopes, mirror), site, loop.frame_rate_hz
 
 
 def of_modes(loop: Recording) -> tuple[Floats, Floats, NDArray[np.int64]]:
     """Return what delay, gain and law of a recording in modes are fitted to."""
     rows = np.isfinite(loop.slopes).all(axis=1)
-    return loop.slopes[rows], loop.commands[rows] @ loop.interaction_matrix.T, runs_of(loop.frame[rows])
+    return _filled(loop.frame[rows], loop.slopes[rows], loop.commands[rows] @ loop.interaction_matrix.T)
+
+
+def _filled(
+    frame: NDArray[np.int64], slopes: Floats, mirror: Floats
+) -> tuple[Floats, Floats, NDArray[np.int64]]:
+    """Return slopes and those of the mirror, interpolated in short gaps, and runs without a gap.
+
+    Where many frames are missing, gaps remain.
+    """
+    steps = np.diff(frame)
+    short = np.flatnonzero((steps > 1) & (steps <= _SHORT_GAP + 1))
+    missing = [number for row in short for number in range(frame[row] + 1, frame[row + 1])]
+    if not missing or len(missing) > _MOST_FILLED * len(frame):
+        return slopes, mirror, runs_of(frame)
+    whole = np.union1d(frame, missing)
+    filled = [
+        np.array([np.interp(whole, frame, column) for column in values.T]).T for values in (slopes, mirror)
+    ]
+    return filled[0], filled[1], runs_of(whole)
 
 
 def known_delay(loop: Recording) -> tuple[LoopDelay, LoopDelay, str]:
@@ -146,7 +168,7 @@ def known_delay(loop: Recording) -> tuple[LoopDelay, LoopDelay, str]:
 
 
 def open_loop_of(loop: Recording, delay: LoopDelay) -> OpenLoop:
-    """Return open-loop slopes, with the noise from deviations from a parabola in time if it is not stated.
+    """Return open-loop slopes, with the noise from their spectra if it is not stated.
 
     Raises
     ------
@@ -170,9 +192,10 @@ def open_loop_of(loop: Recording, delay: LoopDelay) -> OpenLoop:
         grid -= np.nansum(grid, axis=1, keepdims=True) / np.isfinite(grid).sum(axis=1, keepdims=True)
     residual, atmosphere = grid
     measured = np.isfinite(atmosphere)
-    variance, count = noise_variance(atmosphere) if loop.cells is not None else plateau(atmosphere)
-    if count.any():
-        variance = np.where(count > 0, variance, variance[count > 0].mean())
+    noise = plateau(atmosphere) if loop.cells is None else noise_of_slopes(atmosphere)
+    variance, known = noise.variance, np.isfinite(noise.error)
+    if known.any():
+        variance = np.where(known, variance, variance[known].mean())
     least = _LEAST_SIGNAL * float(np.nanvar(atmosphere))
     of_frames = usual = np.maximum(variance, least)
     if loop.standard_errors is not None:
@@ -191,9 +214,8 @@ def open_loop_of(loop: Recording, delay: LoopDelay) -> OpenLoop:
         covariance[~measured.reshape(len(measured), 2, -1).all(axis=1)] = 0.0
     telemetry = OpenLoopTelemetry(np.where(measured, atmosphere, 0.0), of_frames, trust, covariance)
     runs = np.repeat(runs_of(frame), np.diff(frame, append=frame[-1] + 1))
-    # Products of Gaussian noise with its deviation from a parabola have this variance.
-    error = np.where(count > 0, np.sqrt(2.5 / np.maximum(count, 1)), np.nan)
-    return OpenLoop(telemetry, np.where(measured, residual, 0.0), runs, usual, error)
+    errors = noise.error, noise.shared_error
+    return OpenLoop(telemetry, np.where(measured, residual, 0.0), runs, usual, *errors)
 
 
 def _held(loop: Recording, delay: LoopDelay) -> tuple[Floats, NDArray[np.bool_]]:
@@ -205,36 +227,10 @@ def _held(loop: Recording, delay: LoopDelay) -> tuple[Floats, NDArray[np.bool_]]
     caused = loop.commands @ loop.interaction_matrix.T
     for lag, share in ((frames, 1 - part), (frames + 1, part)):
         if share > 0:
-            mirror[lag:] += share * caused[: len(caused) - lag]
-            is_known[:lag] = False
-            is_known[lag:] &= loop.frame[lag:] - loop.frame[: len(caused) - lag] == lag
+            sent = np.searchsorted(loop.frame, loop.frame - lag)
+            mirror += share * caused[sent]
+            is_known &= loop.frame[sent] == loop.frame - lag
     return mirror, is_known
-
-
-def noise_variance(slopes: Floats) -> tuple[Floats, Floats]:
-    """Return the variance of each slope's noise, and the number of frames that it is from.
-
-    From the slopes without each frame's mean along x and y, which fast vibrations change.
-    """
-    n = slopes.shape[1] // 2
-    if n < FEWEST_SUBAPERTURES:
-        return _deviation(slopes)
-    axes = slopes.reshape(-1, 2, n)
-    measured = np.isfinite(axes)
-    mean = np.nansum(axes, axis=2, keepdims=True) / np.maximum(measured.sum(axis=2, keepdims=True), 1)
-    variance, count = _deviation((axes - mean).reshape(slopes.shape))
-    variance = variance.reshape(2, n)
-    # The mean takes some of each slope's noise away, and adds some of the others'.
-    total = variance.sum(axis=1, keepdims=True) * n / (n - 1)
-    return ((variance - total / n**2) / (1 - 2 / n)).ravel(), count
-
-
-def _deviation(slopes: Floats) -> tuple[Floats, Floats]:
-    """Return the variance of slopes about parabolas through their neighbours in time, and the frames."""
-    near, far = slopes[3:-1] + slopes[1:-3], slopes[4:] + slopes[:-4]
-    products = slopes[2:-2] * (slopes[2:-2] - (4 * near - far) / 6)
-    count = np.isfinite(products).sum(axis=0)
-    return np.nansum(products, axis=0) / np.maximum(count, 1), count
 
 
 R0 = "r0 at 500 nm"

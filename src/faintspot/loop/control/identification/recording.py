@@ -115,8 +115,7 @@ class Recording:
     def __post_init__(self) -> None:
         slopes = real_array("slopes", self.slopes, minimum_dimensions=2).astype(np.float64)
         slopes[np.isinf(slopes)] = np.nan
-        if slopes.ndim == 3:  # (frames, n, 2) or (frames, 2, n)
-            slopes = (slopes if slopes.shape[1] == 2 else slopes.swapaxes(1, 2)).reshape(len(slopes), -1)
+        slopes = rows_of_slopes(slopes)
         if slopes.ndim != 2 or (slopes.shape[1] % 2 and self.cells is not None):
             expected = "(frames, 2 n)" if self.cells is not None else "(frames, m)"
             raise InputError(f"slopes: expected shape {expected}, got {slopes.shape}")
@@ -216,11 +215,11 @@ def prepared(recording: Recording) -> Prepared:
         raise InputError(f"{recording.name}: expected slopes that vary, got constant ones")
     _check_alike(recording)
     scaled = _without_unmeasured(recording).scaled(spread)
+    moves = scaled.commands is not None and np.ptp(scaled.commands, axis=0).any()
+    if (moves or not scaled.is_closed) and (doubt := order_doubt(scaled)):
+        scaled = replace(scaled, remarks=(*scaled.remarks, doubt))
     if not recording.is_closed:
-        modes = np.zeros((0, 0)) if scaled.cells is None else modes_of_turbulence(scaled.slopes)
-        remark = order_remark(modes, scaled.cells, of_turbulence=True) if modes.shape[1] else ""
-        remarks = (*scaled.remarks, *([remark] if remark else []))
-        return Prepared(replace(scaled, remarks=remarks), 1.0, 0, math.inf)
+        return Prepared(scaled, 1.0, 0, math.inf)
     if recording.commands is None or recording.interaction_matrix is None:
         return Prepared(scaled, 1.0, 0, math.inf)
     ready = _with_convention(scaled)
@@ -252,6 +251,14 @@ def _exposures(recording: Recording) -> Recording:
         sent_after_frames=None if sent is None else math.ceil(sent / step),
         remarks=(*recording.remarks, remark),
     )
+
+
+def order_doubt(loop: Recording) -> str:
+    """Return a remark if cells may be in another order than the slopes; see `order_remark`."""
+    matrix = loop.interaction_matrix if loop.is_closed else modes_of_turbulence(loop.slopes)
+    if loop.cells is None or matrix is None or not matrix.shape[1]:
+        return ""
+    return order_remark(matrix, loop.cells, of_turbulence=not loop.is_closed)
 
 
 def _check_alike(recording: Recording) -> None:
@@ -344,8 +351,7 @@ def _with_convention(loop: Recording) -> Prepared:
     """Return a closed loop whose commands add, in the rows of the frames that they were computed from."""
     if not np.ptp(loop.commands, axis=0).any():
         return Prepared(loop, 1.0, 0, math.inf)
-    wrong_order = "" if loop.cells is None else order_remark(loop.interaction_matrix, loop.cells)
-    stated, remarks = loop.sent_after_frames, [*loop.remarks, *([wrong_order] if wrong_order else [])]
+    stated, remarks = loop.sent_after_frames, list(loop.remarks)
     correlations, gains = _steps_on_slopes(loop)
     clearest = int(np.argmax(np.abs(correlations)))
     largest = float(np.abs(correlations[clearest]))
@@ -396,6 +402,13 @@ def _steps_on_slopes(loop: Recording) -> tuple[Floats, Floats]:
         both = np.stack([one.ravel(), held.ravel()])
         regressions.append(float((np.linalg.pinv(both @ both.T) @ (both @ other.ravel()))[0]))
     return np.array(correlations), np.array(regressions)
+
+
+def rows_of_slopes(slopes: Floats) -> Floats:
+    """Return slopes of each frame in one row, all x, then all y where they are (n, 2) or (2, n)."""
+    if slopes.ndim == 3 and slopes.shape[2] == 2 != slopes.shape[1]:
+        slopes = slopes.swapaxes(1, 2)
+    return slopes.reshape(len(slopes), -1) if slopes.ndim > 2 else slopes
 
 
 def cells_of(stated: object, n: int) -> NDArray[np.int64]:
