@@ -74,7 +74,7 @@ def without_mean(first: int, lost: np.ndarray) -> np.ndarray:
 
 
 def test_open_loop_slopes_of_a_closed_loop() -> None:
-    """Unknown in frame 100, which was lost, and in the two frames after it, whose mirror is not known."""
+    """Unknown in frame 100, which was lost, and in frame 102, in which its command would act."""
     night = recording()
     night.valid[300, 4] = False
     assert recorded_loop(night, CONTROL, LAYOUT).frame_rate_hz == pytest.approx(1 / FRAME_S, rel=1e-3)
@@ -82,7 +82,7 @@ def test_open_loop_slopes_of_a_closed_loop() -> None:
     first = 40 + 2  # the delay after the loop was closed
     lost = np.zeros((658, 18), bool)
     lost[301 - first, [4, 13]] = True
-    lost[100 - first : 103 - first] = True
+    lost[[100 - first, 102 - first]] = True
     np.testing.assert_allclose(found.open_loop_px, without_mean(first, lost), atol=1e-4)
     np.testing.assert_array_equal(np.isinf(found.variance_px2), lost)
     np.testing.assert_allclose(found.variance_px2[~lost], 0.09, rtol=1e-5)
@@ -104,7 +104,7 @@ def test_the_estimator_s_prior_is_taken_out(prediction: str) -> None:
         setattr(night, name, getattr(night, name) * np.float32(np.sqrt(0.5)))
     found = open_loop(night, control, prior)
     lost = np.zeros((658, 18), bool)
-    lost[100 - 42 : 103 - 42] = True
+    lost[[100 - 42, 102 - 42]] = True
     np.testing.assert_allclose(found.open_loop_px, without_mean(42, lost), atol=1e-3)
     np.testing.assert_allclose(found.variance_px2[~lost], (0.3 * GAIN) ** 2, rtol=1e-4)
     np.testing.assert_allclose(found.trust[~lost], 0.5, rtol=1e-4)

@@ -28,13 +28,8 @@ _ANGLES = np.linspace(0, np.pi / 2, 4)  # from x to y
 _OUTER_SCALE = 40.0  # sub-apertures
 _UPDATES, _POWER = 150, 0.9
 _LEVELS, _HIGHEST, _LIKELY = 16, 1.4, 8.0  # noises tried, in that of the highest frequencies; log likelihood
-_UNKNOWN, _LIMIT = (
-    2.0,
-    1.0,
-)  # log likelihood of the lowest level; then an upper limit is known: relative error
-_LOW = (
-    0.6  # standard errors that the noise beside the likeliest turbulence is too low, in simulated turbulence
-)
+_UNKNOWN, _LIMIT = 2.0, 1.0  # log likelihood of the lowest level, and relative error if there may be none
+_NARROWER, _LOW = 0.8, 0.75  # of the spread; errors by which the likeliest turbulence takes noise for its own
 _SMOOTHED = 5  # frequencies over which the scatter of powers is averaged
 _ALIKE = 0.3  # standard deviation of the turbulence's strength among slopes
 _OF_PARABOLA = 2.5  # variance of the product of Gaussian noise and its deviation from a parabola
@@ -74,14 +69,15 @@ def _noise(slopes: Floats) -> SlopeNoise:
     """Return the noise from spectra, or of too few frames from deviations, of an unknown shared error."""
     (power, length, every), m = _powers(slopes), slopes.shape[1]
     known = np.all(np.isfinite(power[:, 0]).reshape(len(power), 2, m // 2).any(axis=2), axis=1)
-    if np.count_nonzero(known) < _FEWEST_PIECES:
+    if np.count_nonzero(known) < _FEWEST_PIECES or not np.nansum(power[known]) > 0.0:
         near, far = slopes[3:-1] + slopes[1:-3], slopes[4:] + slopes[:-4]
         products = slopes[2:-2] * (slopes[2:-2] - (4 * near - far) / 6)
         count = np.isfinite(products).sum(axis=0)
         error = np.where(count > 0, np.sqrt(_OF_PARABOLA / np.maximum(count, 1)), np.nan)
         return SlopeNoise(np.nansum(products, axis=0) / np.maximum(count, 1), error, math.nan)
     pieces = np.nanmean(power[known].reshape(np.count_nonzero(known), -1, 2, m // 2), axis=3)
-    mean = np.maximum(pieces.mean(axis=0), 1e-300)
+    mean = pieces.mean(axis=0)
+    mean = np.maximum(mean, 1e-12 * float(mean.max()))
     scatter = uniform_filter1d((pieces / mean).var(axis=0, ddof=1), _SMOOTHED, axis=0, mode="nearest")
     weight = INDEPENDENT * len(pieces) / np.maximum(scatter, 2 / m)
     of_axes, shared = [], []
@@ -171,6 +167,7 @@ def _likely(power: Floats, weight: Floats, turbulence: Floats, axis: int) -> tup
         likelihood = np.exp(-unlikely) / np.exp(-unlikely).sum()
         mean = float(likelihood @ deviation)
         spread = math.sqrt(float(likelihood @ np.square(deviation - mean)))
+        spread *= _NARROWER
         if unlikely[0] < _UNKNOWN:  # there may be no noise at all
             spread = max(spread, _LIMIT * mean)
         near = np.flatnonzero(unlikely < _LIKELY)
