@@ -134,6 +134,15 @@ def test_a_loop_is_closed_again_at_half_the_invalid_slopes(part: float, again: b
     assert guard.may_close_again == again
 
 
+@pytest.mark.parametrize(("proven_frames", "again"), [(0, False), (1, True)])
+def test_without_a_number_of_frames_no_loop_is_proven(proven_frames: int, again: bool) -> None:
+    guard = guarded(proven_frames=proven_frames)
+    assert reason(guard, invalid=1.0)
+    for _ in range(300):
+        guard.watch(np.zeros(8), FLAT, FLUX)
+    assert guard.may_close_again == again
+
+
 FLUX, FLAT = np.full(N, 100.0, "f4"), np.zeros(COMMANDS)
 
 

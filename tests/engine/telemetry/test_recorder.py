@@ -179,23 +179,27 @@ def test_a_recording_needs_an_engine_a_new_store_and_limits_above_zero(name: str
 
 
 def test_what_was_overwritten_is_counted(name: str, tmp_path: Path) -> None:
-    """Of rings of 8 records and 3 images; one place of each may be being written to."""
+    """Before two reads, of rings of 8 records and 3 images; one place of each may be being written to."""
     with TelemetryRing.create(name, LAYOUT, records=8, image_slots=3) as ring:
         recording = Recorder(name, tmp_path / "night.zarr")
-        for frame in range(20):
-            write(ring, frame)
-            write_images(ring, frame)
-        for number in range(300):
-            ring.write_change(0, number, {"noise_std": 1.0}, None)
-        report = recording.run(n_frames=7)
-    assert (report.frames, report.dropped) == (7, 13)
-    assert (report.images, report.dropped_images) == (2, 18)
-    assert (report.changes, report.dropped_changes) == (255, 45)  # of 256 places
+
+        def come(first: int) -> None:
+            for frame in range(first, first + 20):
+                write(ring, frame)
+                write_images(ring, frame)
+            for number in range(300):
+                ring.write_change(0, number, {"noise_std": 1.0}, None)
+
+        come(0)
+        report = recording.run(n_frames=14, progress=lambda frames: come(20) if frames == 7 else None)
+    assert (report.frames, report.dropped) == (14, 26)
+    assert (report.images, report.dropped_images) == (4, 36)
+    assert (report.changes, report.dropped_changes) == (510, 90)  # of 256 places
     telemetry = read_telemetry(tmp_path / "night.zarr")
-    assert list(telemetry.image_frame) == [18, 19]
-    assert telemetry.attributes["dropped_records"] == 13
-    assert telemetry.attributes["dropped_images"] == 18
-    assert telemetry.attributes["dropped_changes"] == 45
+    assert list(telemetry.image_frame) == [18, 19, 38, 39]
+    assert telemetry.attributes["dropped_records"] == 26
+    assert telemetry.attributes["dropped_images"] == 36
+    assert telemetry.attributes["dropped_changes"] == 90
 
 
 def test_methods_that_came_later_are_named(name: str, tmp_path: Path) -> None:
