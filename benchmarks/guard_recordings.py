@@ -199,4 +199,4 @@ def table(flux_e: float, name: str = "", say: Callable[[str], None] = lambda tex
 
 if __name__ == "__main__":
     for flux_e in [float(sys.argv[1])] if len(sys.argv) > 1 else FAULT_FLUXES_E:
-        table(flux_e, *sys.argv[2:3], say=lambda text: print(text, flush=True))
+        table(flux_e, "".join(sys.argv[2:3]), lambda text: print(text, flush=True))

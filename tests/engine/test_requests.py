@@ -22,6 +22,7 @@ from tests.refusals import refused
 
 from faintspot.base.errors import InputError
 from faintspot.engine import requests as control
+from faintspot.engine.request_handlers import while_starting
 from faintspot.engine.requests import LARGEST_REQUEST, ControlServer, request, socket_path
 
 pytestmark = pytest.mark.slow
@@ -111,6 +112,15 @@ def test_errors_come_back_in_one_line(server: ControlServer, command: str, named
     with refused(named):
         request(server.path, command)
     assert is_well(server.path)
+
+
+def test_an_engine_that_starts_refuses_until_it_is_there(path: Path) -> None:
+    handlers = while_starting()
+    with ControlServer(path, handlers):
+        with refused():
+            request(path, "status")
+        handlers["status"] = lambda fields: {"state": "there"}
+        assert request(path, "status")["state"] == "there"
 
 
 def test_a_large_reply_arrives_whole_and_a_huge_one_is_refused(server: ControlServer) -> None:

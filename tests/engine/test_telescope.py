@@ -127,6 +127,25 @@ def test_frames_and_truth_are_the_simulated_loops(
     assert np.ptp(record.strehl) > 0.05  # commands do something
 
 
+def test_an_exposure_waits_for_the_command_that_is_due(name: str, commands: Any) -> None:
+    """Of an engine that is slower than the camera; without waiting, older commands act."""
+    truths: list[tuple[float, ...]] = []
+    with Watched(name, waits=True, keep_truth=truths.append) as watched:
+        engine = PixelRing.attach(name, follows=True)
+        engine.follow(0)
+        with watched.observing():
+            for number in range(8):
+                wait_for(lambda number=number: engine.last_row_time_ns(number, number + 1) > 0)
+                time.sleep(0.02)  # twenty frame times
+                commands.write(np.full(COMMANDS, 10.0 * number), frame_id=number)
+                engine.follow(number + 1)
+        engine.unfollow()
+        engine.close()
+    acted = [truth[TRUTH.index("command_frame")] for truth in truths]
+    assert len(acted) >= 8
+    assert acted[2:8] == [0, 1, 2, 3, 4, 5]
+
+
 def test_each_realisation_has_its_turbulence(name: str) -> None:
     with Watched(name, realisation=1, seed=5) as watched:
         telescope_model = TelescopeModel(CONFIGURATION, 5, 1)

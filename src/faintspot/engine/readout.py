@@ -111,6 +111,7 @@ class Readout(ABC):
         block = int(number_between("rows_per_block", rows_per_block, 1, rows, integer=True))
         self._ring, self._period_ns, self._next = ring, 1e9 / rate, first_number
         self._spins, self.late, self.overruns = spins, 0, 0
+        self._stop = threading.Event()
         ends = [*range(block, rows, block), rows]
         # First row, last row and time after the start of the frame, for each block.
         self._blocks = [
@@ -141,8 +142,9 @@ class Readout(ABC):
         """
         limit = None if n_frames is None else int(number_between("n_frames", n_frames, 1, integer=True))
         start, tick, published, reported_ns = time.monotonic_ns(), 0, 0, 0
+        self._stop = threading.Event() if stop is None else stop
         self.late = self.overruns = 0
-        while (limit is None or published < limit) and not (stop is not None and stop.is_set()):
+        while (limit is None or published < limit) and not self._stop.is_set():
             frame = self._frame()  # before its scheduled time, because it may have to be fetched
             if frame is None:
                 break
@@ -173,6 +175,14 @@ class Readout(ABC):
             slot[first:last] = frame[first:last]
             ring.rows_ready(last)
         self._next += 1
+
+    def _await_engine(self, arrival: int) -> bool:
+        """Wait until the engine has finished an arrival; return False if it will not."""
+        while (followed := self._ring.followed) is not None and not self._stop.is_set():
+            if followed[0] >= arrival:
+                return True
+            _nap()
+        return False
 
 
 def readout_type(detector: Detector) -> np.dtype[np.generic]:
@@ -280,7 +290,6 @@ class Replay(Readout):
         self._chunks = self._converted()
         self._reader = ThreadPoolExecutor(1, "faintspot-reader")
         self._ahead: deque[Future[NDArray[np.generic] | None]] = deque()
-        self._stop: threading.Event = threading.Event()
 
     def run(
         self,
@@ -332,14 +341,6 @@ class Replay(Readout):
     def _read(self) -> NDArray[np.generic] | None:
         """Read the next block; return None at the end."""
         return next(self._chunks, None)
-
-    def _await_engine(self, arrival: int) -> bool:
-        """Wait until the engine has finished an arrival; return False if it will not."""
-        while (followed := self._ring.followed) is not None and not self._stop.is_set():
-            if followed[0] >= arrival:
-                return True
-            _nap()
-        return False
 
     def _converted(self) -> Iterator[NDArray[np.generic]]:
         """Yield blocks of the frames in the ring's type, for the reader's thread."""

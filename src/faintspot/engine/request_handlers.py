@@ -6,6 +6,8 @@ from dataclasses import replace
 from functools import partial
 from typing import Any
 
+from numba.core import event
+
 from faintspot.base.checks import number_between, one_of
 from faintspot.base.errors import InputError
 from faintspot.engine.engine import Engine
@@ -17,7 +19,21 @@ from faintspot.slopes.pipeline.configuration import Configuration
 LENGTHY = ("set", "interleave", "load", "unload", "learnt", "spots")
 """Commands that prepare something new and may compile; other commands are answered meanwhile."""
 _USUAL_TURN = 50  # frames
+_FUNCTIONS = 70  # compiled when a pipeline with an integrator starts for the first time
 LOOP_ACTIONS = ("status", "open", "close", "gain", "flat")
+
+
+def while_starting(part: str = "") -> dict[str, Handler]:
+    """Return the commands of an engine that is not there yet: "status" is refused with how far it is."""
+    compiled = event.RecordingListener()
+    event.register("numba:compile", compiled)
+
+    def refuse(fields: object) -> Mapping[str, Any]:
+        count = sum(each.is_end for _, each in compiled.buffer)
+        compiles = f", {count} of about {max(count, _FUNCTIONS)} functions compiled{part}" if count else ""
+        raise InputError(f"it starts{compiles}{'; later starts are fast' if count else ''}")
+
+    return {"status": refuse}
 
 
 def commands_of(engine: Engine) -> dict[str, Handler]:

@@ -235,7 +235,7 @@ class ControlServer(Closing):
     path : str or Path
         Socket; see `socket_path`. A lock file beside it shows whether a server is alive or has died.
     handlers : mapping of str to function
-        Function of each command. An exception becomes the reply's error.
+        Function of each command; it may change while the server runs. An exception becomes the reply's error.
     lengthy : collection of str
         Commands that may take long.
 
@@ -249,7 +249,7 @@ class ControlServer(Closing):
         self, path: str | Path, handlers: Mapping[str, Handler], lengthy: Collection[str] = ()
     ) -> None:
         self.path = Path(path)
-        self._handlers, self._brief_one = dict(handlers), threading.Lock()
+        self._handlers, self._brief_one = handlers, threading.Lock()
         self._lengthy_ones = {command: threading.Lock() for command in lengthy}
         self._closing = False
         self._lock_file = locked_beside(self.path)

@@ -133,6 +133,9 @@ class SimulatedTelescope(Readout, Closing):
     that of `simulate_loop` with the same commands, seed and realisation; late frames delay the atmosphere,
     too. Simulation and read-out run in separate threads.
 
+    With `waits`, an exposure begins no earlier than the engine, if one runs, has sent the command that is due
+    then: on a slow machine there are fewer frames in a second, but the loop is the same.
+
     Rows go into the pixel ring NAME. After the last one, the stream NAME_truth gets the truth (`TRUTH`) and
     NAME_frames the whole frame, both stamped with its number.
 
@@ -147,6 +150,8 @@ class SimulatedTelescope(Readout, Closing):
     realisation : int
     say : function, optional
         Called with a one-line message about the commands, and when the pace cannot be kept.
+    waits : bool
+        Whether to wait for the command that is due.
     keep_truth : function, optional
         Called with the values of `TRUTH` after each frame.
     **rows
@@ -173,11 +178,12 @@ class SimulatedTelescope(Readout, Closing):
         seed: int | None = None,
         realisation: int = 0,
         say: Callable[[str], None] | None = None,
+        waits: bool = False,
         keep_truth: Callable[[tuple[float, ...]], None] | None = None,
         **rows: Any,
     ) -> None:
         self.configuration, self.name, self._say = configuration, name, say or (lambda _: None)
-        self._keep_truth = keep_truth
+        self._keep_truth, self._waits = keep_truth, waits
         self._conditions = ObservingConditions.of(configuration)
         start = configuration.run.seed if seed is None else seed
         self.telescope_model = telescope_model = TelescopeModel(configuration, start, realisation)
@@ -285,6 +291,8 @@ class SimulatedTelescope(Readout, Closing):
 
     def _begin(self, number: int) -> Future[Exposure]:
         """Begin an exposure with the present conditions and commands."""
+        if self._waits:  # the newest command that can be there is that of the last frame but one
+            self._await_engine(number + 1 - max(2, self.configuration.control.delay_frames))
         begun_s = time.monotonic()
         self.commands.update()
         time_s = (number + 0.5) / self.configuration.control.frame_rate_hz

@@ -86,6 +86,7 @@ def shown(turns: int) -> Shown:
     seen.begin(["brightest", "window", "map"])
     seen.status = {
         "counters": COUNTERS,
+        "telescope": {"frame_rate_hz": 100.0, "frames": 600, "overruns": 200},
         "loop": {"latency": {"p50_us": 40.0, "p99_us": 90.0}, "opened_because": None},
     }
     for frame in range(60 * turns):
@@ -115,7 +116,8 @@ def test_table_has_the_gain_over_the_first_method() -> None:
     assert "0.500 ± 0.000  +0.200 ± 0.000" in console.export_text()
     words = in_words(seen)
     assert words[0].startswith("600 frames measured, 3 lost; ")
-    assert len(words) == 3
+    assert "75 of 100 frames/s" in words[1]
+    assert len(words) == 4
 
 
 @pytest.mark.slow

@@ -61,11 +61,12 @@ def test_truth_and_commands_of_streams(name: str) -> None:
             create_stream(f"{name}_truth", (len(TRUTH),)),
             create_stream(f"{name}_commands", (3,)),
         )
-        values = dict.fromkeys(TRUTH, 0.0) | {"frame": 7.0, "strehl": 0.5, "rms_nm": 150.0}
+        values = dict.fromkeys(TRUTH, 0.0) | {"frame": 7.0, "strehl": 0.5, "rms_nm": 150.0, "time_s": 0.06}
         truth.write(np.array(list(values.values())), frame_id=7)
         commands.write(np.array([1.0, -2.0, 3.0]), frame_id=7)
         batch = next_batch(source)
         assert batch.truth == (7, 0.5, 150.0)
+        assert source.state()["camera_hz"] == 125.0  # 0.06 s is the middle of frame 7
         assert batch.commands is not None
         assert batch.commands.tolist() == [1.0, -2.0, 3.0]
         again = next_batch(source)

@@ -16,7 +16,14 @@ from faintspot.cli.output import progress_bar
 @click.command("learn", short_help="Learn a Kalman filter from a recording of the closed loop.")
 @click.argument("store", type=click.Path(path_type=Path), metavar="STORE")
 @configuration_option("Configuration with [control].")
-def learn(store: Path, config: str) -> None:
+@option(
+    "--frame-rate-hz",
+    type=click.FloatRange(0, min_open=True),
+    metavar="HZ",
+    help="Frame rate in the time of the turbulence, of a simulated telescope that waits.",
+    show_default="as recorded",
+)
+def learn(store: Path, config: str, frame_rate_hz: float | None) -> None:
     """Learn a Kalman filter from a recording of the loop, closed with an integrator, and put it into TOML.
 
     STORE is what `faintspot realtime record` wrote while the engine ran with TOML, at least 200 frames
@@ -45,8 +52,9 @@ def learn(store: Path, config: str) -> None:
     layout, recording = described.layout, read_telemetry(store, images=False)
     prior = prior_std_px(described.settings, layout)
     loop = recorded_loop(recording, control, layout, prior)
-    _, delay, unknown = known_delay(loop)
-    telemetry, rate_hz = open_loop_of(loop, delay).telemetry, loop.frame_rate_hz
+    rate_hz = loop.frame_rate_hz if frame_rate_hz is None else frame_rate_hz
+    _, delay, unknown = known_delay(replace(loop, frame_rate_hz=rate_hz))
+    telemetry = open_loop_of(loop, delay).telemetry
     with progress_bar("Filter", "steps") as show:
         learnt = learn_controller(control.plant, telemetry, site_of(layout), rate_hz, progress=show)
     path = derived(config, ".model.npz")

@@ -177,7 +177,7 @@ def run(
     from faintspot.engine.engine import Engine
     from faintspot.engine.interleaving import Interleaving
     from faintspot.engine.plan import EngineOptions
-    from faintspot.engine.request_handlers import LENGTHY, commands_of
+    from faintspot.engine.request_handlers import LENGTHY, commands_of, while_starting
     from faintspot.engine.requests import ControlServer
     from faintspot.engine.workers import PipelineMaker
     from faintspot.loop.control.configuration import load_control
@@ -189,37 +189,33 @@ def run(
     if close_loop and control is None:
         raise InputError(f"--close-loop: expected [control] in {config}, which says what makes commands")
     reference = None if control is None else control.reference
-    engine = Engine(
-        name,
-        PipelineMaker(layout, described.calibration, reference=reference, **described.spot),
-        settings,
-        EngineOptions(cpus=cpus, deadline_s=deadline_us * 1e-6, **options),
-        source=None if stream is None else _followed(stream, name),
-        interleaving=None if interleave is None else Interleaving.parse(interleave, every),
-        control=control,
-    )
-    if engine.loop is not None and close_loop:
-        engine.loop.close()
-    server = ControlServer(socket_path(name), commands_of(engine), lengthy=LENGTHY)
-    learns = nullcontext() if interleave else _learning(engine, config)
-    page = page_beside(name) if live else nullcontext()
-    # Processes beside the engine start first: otherwise they would have its processors and priority.
-    with (
-        server,
-        stop_on_signal() as stop,
-        learns,
-        page,
-        real_time(cpus, priority) as refused,
-    ):
-        engine.refused = refused
-        for line in refused:
-            click.echo(f"not permitted, going on without: {line}", err=True)
-        click.echo(
-            f"{name}: {len(layout)} sub-apertures, estimator {settings.estimator.name}; waiting for frames, "
-            "Ctrl-C stops"
+    handlers = while_starting()
+    with ControlServer(socket_path(name), handlers, lengthy=LENGTHY):  # answers while the engine compiles
+        engine = Engine(
+            name,
+            PipelineMaker(layout, described.calibration, reference=reference, **described.spot),
+            settings,
+            EngineOptions(cpus=cpus, deadline_s=deadline_us * 1e-6, **options),
+            source=None if stream is None else _followed(stream, name),
+            interleaving=None if interleave is None else Interleaving.parse(interleave, every),
+            control=control,
         )
-        threading.Thread(target=_stop_when_set, args=(stop, engine), daemon=True).start()
-        engine.run(frames)
+        handlers.update(commands_of(engine))
+        if engine.loop is not None and close_loop:
+            engine.loop.close()
+        learns = nullcontext() if interleave else _learning(engine, config)
+        page = page_beside(name) if live else nullcontext()
+        # Processes beside the engine start first: otherwise they would have its processors and priority.
+        with stop_on_signal() as stop, learns, page, real_time(cpus, priority) as refused:
+            engine.refused = refused
+            for line in refused:
+                click.echo(f"not permitted, going on without: {line}", err=True)
+            click.echo(
+                f"{name}: {len(layout)} sub-apertures, estimator {settings.estimator.name}; waiting for "
+                "frames, Ctrl-C stops"
+            )
+            threading.Thread(target=_stop_when_set, args=(stop, engine), daemon=True).start()
+            engine.run(frames)
     click.echo(summary(engine.status()))
 
 

@@ -44,6 +44,12 @@ if TYPE_CHECKING:
     metavar="KIND",
     help="Control that --write-config prepares: integrator, or kalman, which learns for a minute.",
 )
+@option(
+    "--wait",
+    "waits",
+    is_flag=True,
+    help="Wait for the engine's command where it is late: time stands still meanwhile.",
+)
 @READOUT_FRACTION
 @option(
     "--rows-per-block",
@@ -192,12 +198,14 @@ def in_words(shown: Shown) -> list[str]:
     status = shown.status
     if status is None:
         return ["ended before there was a loop"]
-    counters, loop = status["counters"], status["loop"]
+    counters, loop, camera = status["counters"], status["loop"], status["telescope"]
+    reached = camera["frame_rate_hz"] * camera["frames"] / (camera["frames"] + camera["overruns"])
     lost = counters["dropped"] + counters["skipped"]
     latency = loop["latency"]
     lines = [
         f"{counters['processed']} frames measured, {lost} lost; from the last row to the commands p50 "
-        f"{latency['p50_us']:.0f} us, p99 {latency['p99_us']:.0f} us"
+        f"{latency['p50_us']:.0f} us, p99 {latency['p99_us']:.0f} us",
+        f"{reached:.0f} of {camera['frame_rate_hz']:g} frames/s: late commands are waited for",
     ]
     if math.isfinite(shown.on_time):
         lines.append(

@@ -18,7 +18,8 @@ from faintspot.base.files import Closing, derived, output_errors, write_atomical
 from faintspot.engine.child_processes import ONE_THREAD, ChildProcesses
 from faintspot.engine.control_loop import CLOSED, STATES
 from faintspot.engine.interleaving import short_names
-from faintspot.engine.requests import LENGTHY_TIMEOUT_S, request, socket_path
+from faintspot.engine.request_handlers import while_starting
+from faintspot.engine.requests import TELESCOPE, ControlServer, request, socket_path
 from faintspot.engine.streams.stream import Follower
 from faintspot.engine.telemetry.numbers import MethodDifference, compared_methods
 from faintspot.engine.telemetry.ring import TelemetryRing
@@ -42,7 +43,7 @@ _TURN_S = 1.0
 _IMAGES_EVERY = 10
 _SETTLE_FRAMES = 20  # start of a turn, affected by the previous method
 _OPEN_FRAMES = 100  # before the loop is closed, to set the guard's limit
-_LEARN_FRAMES = 1000
+_LEARN_FRAMES = 2000
 _COMPILING_S = 600.0  # time limit of the engine, which compiles on first use, and of the learning
 _PATIENCE_S = 60.0
 _LOOKS_PER_FRAME = 4
@@ -151,19 +152,21 @@ class LiveDemonstration:
         self._check_name()
         shown = Shown(self.observed.control.delay_frames)
         loop, name = self.write_loop(), ["--name", self.name]
+        observed = [*name, "--seed", str(self.seed), "--wait"]
         with ChildProcesses(self.folder) as processes:
 
             def wait(condition: Callable[[], bool], awaited: str, timeout_s: float) -> None:
                 processes.wait_until(lambda: stop.is_set() or condition(), awaited, timeout_s)
 
             processes.start(_PAGE, ["live", *name, "--port", str(self.port)])
-            processes.start(_TELESCOPE, ["realtime", "telescope", str(loop), *name, "--seed", str(self.seed)])
+            processes.start(_TELESCOPE, ["realtime", "telescope", str(loop), *observed])
             wait(lambda: len(processes.output(_PAGE)) > 0, "the page", _PATIENCE_S)
             if stop.is_set():
                 return shown
             say(f"{processes.output(_PAGE)[0]}\nOpen it in a browser; Ctrl-C ends it and prints a table")
             say(f"starting telescope and engine, which compiles on first use; files: {self.folder}")
-            engine, window = self.write_engine()
+            with ControlServer(socket_path(self.name), while_starting(" in part 1 of 2")):
+                engine, window = self.write_engine()
             first = ["--interleave", window, "--images-every", str(_IMAGES_EVERY)]
             processes.start(_ENGINE, ["realtime", "run", "--config", str(engine), *name, *first])
             wait(lambda: self._frames_measured() >= _OPEN_FRAMES, "slopes of the engine", _COMPILING_S)
@@ -177,7 +180,8 @@ class LiveDemonstration:
                 self._learn(engine, window, processes, watcher, say)
                 say(f"methods compared for {seconds:g} s: {', '.join(shown.methods)}")
                 watcher.watch(seconds)
-            shown.status = self._asked("status")
+            telescope = request(socket_path(self.name, TELESCOPE), "status")
+            shown.status = {**self._asked("status"), "telescope": telescope}
         return shown
 
     def _learn(
@@ -187,13 +191,14 @@ class LiveDemonstration:
         store = self.folder / "telemetry.zarr"
         shutil.rmtree(store, ignore_errors=True)
         say(f"a Kalman filter is learnt from {_LEARN_FRAMES} frames of the closed loop")
+        told = [str(store), "--config", str(engine), "--frame-rate-hz", f"{self.rate_hz:g}"]
         recording = [str(store), "--name", self.name, "--frames", str(_LEARN_FRAMES)]
         processes.start(_RECORDER, ["realtime", "record", *recording])
         watcher.watch(_COMPILING_S, until=lambda: processes.finished(_RECORDER))
         if watcher.stopped():
             return
         self._interleave(methods := ["none", "tv", window], watcher.shown)
-        processes.start(_LEARNER, ["realtime", "learn", str(store), "--config", str(engine)], ONE_THREAD)
+        processes.start(_LEARNER, ["realtime", "learn", *told], ONE_THREAD)
         try:
             watcher.watch(_COMPILING_S, until=lambda: processes.finished(_LEARNER))
             if watcher.stopped():
@@ -205,7 +210,7 @@ class LiveDemonstration:
     def _interleave(self, methods: list[str], shown: Shown) -> None:
         """Let methods take turns from now on."""
         turns = {"methods": ",".join(methods), "every": self.turn_frames}
-        self._asked("interleave", timeout_s=LENGTHY_TIMEOUT_S, **turns)
+        self._asked("interleave", timeout_s=_COMPILING_S, **turns)
         shown.begin(short_names(methods))
 
     def _check_name(self) -> None:
@@ -241,7 +246,7 @@ class Shown:
     truth: dict[int, tuple[float, float]] = field(default_factory=dict)
     """Strehl ratio, and frame whose commands acted, by frame number; for the frames that were read."""
     status: dict[str, Any] | None = None
-    """Status of the engine at the end."""
+    """Status of the engine at the end, with that of the telescope."""
 
     def begin(self, methods: list[str]) -> None:
         """Let other methods take turns; the first ever follow the single method of the start."""

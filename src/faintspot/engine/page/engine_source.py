@@ -19,7 +19,7 @@ from faintspot.engine.telescope import TRUTH
 from faintspot.io.telemetry import StoredTelemetry, stored_names
 from faintspot.slopes.sensor.layout import Layout
 
-_TRUTH_FIELDS = tuple(TRUTH.index(name) for name in ("strehl", "rms_nm"))
+_TRUTH_FIELDS = tuple(TRUTH.index(name) for name in ("strehl", "rms_nm", "time_s"))
 
 
 class EngineSource:
@@ -45,6 +45,7 @@ class EngineSource:
         self._reader: TelemetryRing | None = None
         self._truth, self._commands = Follower(f"{name}_truth"), Follower(f"{name}_commands")
         self._cursors = [0, 0, 0]  # records, images, changes
+        self._camera_hz: float | None = None
 
     def read(self) -> Batch | None:
         """Return the data since the last call; None while there is no engine."""
@@ -76,9 +77,9 @@ class EngineSource:
         )
 
     def state(self) -> dict[str, Any]:
-        """Return the engine's name and whether it is running."""
+        """Return the engine's name, whether it is running, and the frame rate of a simulated camera."""
         is_running = self._reader is not None
-        return {"kind": "engine", "name": self.name, "there": is_running}
+        return {"kind": "engine", "name": self.name, "there": is_running, "camera_hz": self._camera_hz}
 
     def close(self) -> None:
         """Close the shared memory."""
@@ -106,7 +107,8 @@ class EngineSource:
         truth = self._truth.newest()
         if truth is None or len(truth.values) != len(TRUTH):
             return None
-        strehl, rms_nm = truth.values[list(_TRUTH_FIELDS)]
+        strehl, rms_nm, time_s = truth.values[list(_TRUTH_FIELDS)]
+        self._camera_hz = round((truth.number + 0.5) / time_s, 3) if time_s > 0 else None
         return (truth.number, float(strehl), float(rms_nm)) if np.isfinite([strehl, rms_nm]).all() else None
 
 

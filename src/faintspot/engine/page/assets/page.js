@@ -63,6 +63,7 @@ function sensorCame() {
   for (const canvas of document.querySelectorAll("canvas[data-shape]")) {
     canvas.style.aspectRatio = `${columns} / ${rows}`;
   }
+  for (const panels of document.querySelectorAll("main, #tiles")) panels.hidden = false;
   reach = 0.5;
   flux = [0, 1];
 }
@@ -76,7 +77,7 @@ function showState() {
   state.dataset.state = there && !held ? "live" : "waiting";
   state.textContent = !connected ? "connecting" : held ? "held" : !place ? "waiting"
     : place.kind === "recording" ? (place.playing ? "playing" : "paused")
-      : place.there ? "live" : `waiting for the engine ${place.name}`;
+      : place.there ? "live" : `waiting for the engine ${place.name}${status?.error ? `: ${status.error}` : ""}`;
   if (!place) return;
   say("name", place.name);
   document.title = `${place.name} · faintspot`;
@@ -325,10 +326,11 @@ function list(id, entries) {
 
 function showTiles() {
   const figures = known.figures?.values || {}, now = known.now?.values || {}, loop = known.status?.values.loop;
+  const camera = known.place?.values.camera_hz;
   const percentiles = figures.percentiles_us || {};
   list("tiles", [
     ["frame", now.frame === undefined ? "–" : String(now.frame)],
-    ["frames/s", inWords(figures.rate_hz)],
+    ["frames/s", inWords(figures.rate_hz) + (camera ? ` of ${inWords(camera)}` : "")],
     ["latency p50", `${inWords(percentiles[50])} µs`],
     ["p99", `${inWords(percentiles[99])} µs`],
     ["lost frames", inWords(now.lost)],
