@@ -1,13 +1,16 @@
 """Geometry and gaps of recorded loops."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from tests.loop.telemetry.loop_cases import AIR, recorded
 
 from faintspot.base.errors import InputError
+from faintspot.loop.control.identification import open_loop
 from faintspot.loop.control.identification.layers import Identified
+from faintspot.loop.control.identification.loop_delay import LoopDelay
 from faintspot.loop.control.identification.open_loop import (
     measured_delay,
     open_loop_of,
@@ -51,6 +54,17 @@ def test_lost_frames_here_and_there_change_neither_delay_nor_gain() -> None:
     assert found.delay_frames == pytest.approx(2, abs=0.2)
     assert found.gain == pytest.approx(whole.gain, abs=0.06)
     assert open_loop_of(loop.part(kept), used).telemetry.trust.any(axis=1).mean() > 0.88
+
+
+@pytest.mark.parametrize(("fitted", "used"), [(1.37, 1.37), (1.67, 1.67), (2.06, 2.0)])
+def test_a_fitted_delay_is_used(fitted: float, used: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also where a whole number is within its error; what is close to one is that number."""
+    fits = SimpleNamespace(
+        best=lambda: LoopDelay(fitted, 0.4, 0.9, 0.1), of=lambda delay: LoopDelay(delay, 0.0, 0.8, 0.1)
+    )
+    monkeypatch.setattr(open_loop, "DelayFits", lambda *loop: fits)
+    found, chosen = measured_delay(recorded())
+    assert (found.delay_frames, chosen.delay_frames) == (fitted, used)
 
 
 def test_infinite_slopes_count_as_not_measured() -> None:

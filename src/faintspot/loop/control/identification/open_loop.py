@@ -72,7 +72,7 @@ def runs_of(frame: NDArray[np.int64]) -> NDArray[np.int64]:
 
 
 def measured_delay(loop: Recording) -> tuple[LoopDelay, LoopDelay]:
-    """Return delay and gain as measured and as used, the latter for whole frames if consistent.
+    """Return delay and gain as measured and as used, the latter for whole frames if close to them.
 
     Raises
     ------
@@ -88,9 +88,7 @@ def measured_delay(loop: Recording) -> tuple[LoopDelay, LoopDelay]:
     fits = ModalFits(*of_modes(loop)) if loop.cells is None else DelayFits(*_of_fit(loop))
     fit = used = fits.best() if loop.delay_frames is None else fits.of(loop.delay_frames)
     nearest = float(round(fit.delay_frames))
-    if loop.delay_frames is None and abs(fit.delay_frames - nearest) < max(
-        _WHOLE_FRAMES, 2 * fit.delay_error
-    ):
+    if loop.delay_frames is None and abs(fit.delay_frames - nearest) < _WHOLE_FRAMES:
         used = fits.of(nearest)
     if not min(GAINS) < used.gain < max(GAINS):
         raise InputError(

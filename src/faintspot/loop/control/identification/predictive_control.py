@@ -41,7 +41,7 @@ _MEASURED_FRAMES = 60  # that the integrator drives the mirror first, so that it
 _EASED_FRAMES = 100  # in which the fallback's gain goes from the recorded one to its own
 _ABSURD = 1e3  # of the rms of recorded slopes: no such slope is measured
 _CONTENTS = "a predictive controller"
-_RELEARNT_FROM = 750  # frames since the integrator took over, from which is learnt in the background
+_RELEARNT_FROM = 520  # frames since the integrator took over, from which is learnt in the background
 _PLAIN_AT_FIRST = 200  # frames in which it may drive because the filter has just begun
 _RELEARNT_EVERY = 5000  # frames, while the filter drives
 
