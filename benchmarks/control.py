@@ -225,7 +225,8 @@ def _control(across: int, rng: np.random.Generator) -> tuple[PredictiveControl, 
     arrays = dense if m <= _MOST_SLOPES else random_filter(cells, rng)
     model = Kalman(arrays, 0.3, 1.0, (1.0, 2.0), np.eye(commands))
     measured = np.array([2.0, 0.1, 1.0, 0.1, 1.0, 0.1])
-    loop = _RandomLoop(interaction, np.ones(m), np.ones(m), 1.0, measured, np.zeros((0, 6)), 1.0, 0.3, 0)
+    numbers = measured, np.zeros((0, 6)), np.ones(commands), 0.3, 0
+    loop = _RandomLoop(interaction, np.ones(m), np.ones(m), 1.0, *numbers)
     return PredictiveControl(loop, model), np.asarray(0.1 * rng.standard_normal(m))
 
 

@@ -74,11 +74,11 @@ def commands_of_matrices(file: Mapping[str, Any], slopes: Floats) -> Floats:
     state, sent = np.zeros(len(file["state_of_state"])), []
     held = np.zeros((int(file["delay_frames"]), len(file["command_of_state"])))
     for row in slopes:
-        inputs = {"state": state, "slopes": row, "mirror": held[0]}
+        inputs = {"state": state, "slopes": row - file["reference_slopes"], "mirror": held[0]}
         command, state = (
             sum(file[f"{name}_of_{key}"] @ values for key, values in inputs.items())
             for name in ("command", "state")
         )
         held = np.vstack([held[1:], command])
-        sent.append(command)
+        sent.append(command + file["flat_command"])
     return np.array(sent)

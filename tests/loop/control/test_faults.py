@@ -41,6 +41,24 @@ FAULTS: dict[str, tuple[Damage, list[int]]] = {
 }
 
 
+def both_of(number: int, value: float, noise: float) -> Damage:
+    """Return what writes slopes that hardly change, as of a window with a hot pixel."""
+
+    def damaged(slopes: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        slopes = slopes.copy()
+        slopes[:, [number, number + N]] = value + noise * rng.standard_normal((len(slopes), 2))
+        return slopes
+
+    return damaged
+
+
+FAULTS |= {
+    "hot pixel": (both_of(7, 0.8, 0.05), [7]),
+    "nearly 0": (both_of(7, 0.0, 0.001), [7]),
+    "half the gain": (lambda slopes, rng: slopes * np.where(np.arange(2 * N) % N == 7, 0.5, 1.0), []),
+}
+
+
 @pytest.mark.parametrize("name", FAULTS)
 def test_recording_with_a_fault(name: str) -> None:
     """What sticks is not measured, from its first frame on, nor is the other axis of the sub-aperture."""
@@ -65,6 +83,21 @@ def test_sub_apertures_with_the_same_slopes_and_rows_of_zero() -> None:
     assert np.flatnonzero(np.isnan(ready.slopes[0, :N])).tolist() == [3, 9, 20]
     assert sum("sub-aperture" in remark for remark in ready.remarks) == 2
     assert not followers(loop.slopes).any()
+
+
+@pytest.mark.parametrize("delay", [1, 3])
+def test_no_sub_aperture_of_a_sound_loop_is_silent(delay: int) -> None:
+    loop = recorded(delay, 0.6, frames=900)
+    assert np.isfinite(prepared(loop).recording.slopes).all()
+
+
+def test_rows_that_repeat_are_not_measured() -> None:
+    watch, rng = StuckWatch(2 * N), np.random.default_rng(4)
+    errors = np.ones(2 * N)
+    rows = rng.standard_normal((4, 2 * N))
+    for number, is_new in ((0, True), (1, True), (1, False), (0, True), (0, False)):
+        used = watch(rows[number], errors)
+        assert np.isfinite(used).all() if is_new else np.isinf(used).all()
 
 
 def test_a_recording_in_which_everything_is_stuck() -> None:

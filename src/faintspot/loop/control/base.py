@@ -30,12 +30,12 @@ class CommandDelayLine:
         Number of actuators.
     delay_frames : int
         The command computed from frame k acts first during frame k + delay_frames.
-    largest : float
+    largest : float or (commands,) array
         Stroke: no command is sent that is larger. What is cut off is forgotten, so that nothing winds up.
     """
 
-    def __init__(self, commands: int, delay_frames: int, largest: float = math.inf) -> None:
-        self.delay_frames, self.largest = delay_frames, largest
+    def __init__(self, commands: int, delay_frames: int, largest: ArrayLike = math.inf) -> None:
+        self.delay_frames, self.largest = delay_frames, np.full(commands, largest, np.float64)
         self.rows = np.zeros((delay_frames + 1, commands))
         """(delay_frames + 1, commands): the latest commands."""
         self.next_row = 0

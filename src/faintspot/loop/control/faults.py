@@ -20,9 +20,14 @@ Mask = NDArray[np.bool_]
 
 STUCK_FRAMES = 50
 """Frames with three values at most after which a slope counts as stuck, and with others until it is not."""
-_VALUES = 3
+_VALUES, _LATEST, _FEWEST_REPEATED = (
+    3,
+    4,
+    8,
+)  # rows of values and of the latest; fewer slopes may repeat by chance
 _STILL, _WANDERS = 0.5, 10.0
 """Response and variance of the commands of an actuator that does not move, in those of the median one."""
+_SILENT = 0.25  # part of the median response of slopes below which a sub-aperture does not see the wavefront
 _SURE = 2.0  # standard errors
 # After one frame the noise of both is the same: there, the steps before stand for those sent. So it is where
 # no later response of the median actuator is as large as the second number.
@@ -84,6 +89,14 @@ def _watch(slopes: Any, errors: Any, recent: Any, sums: Any, used: Any) -> float
     Return the mean square of slopes that are not used but change, in that of those that are used.
     """
     m, left_out, others, size, inside = slopes.shape[0], 0.0, 0.0, 0.0, 0.0
+    seen = fresh = 0
+    for s in range(m):
+        used[s] = math.inf
+        if errors[s] < math.inf:
+            seen, fresh = seen + 1, fresh + (slopes[s] != recent[_LATEST, s])
+            recent[_LATEST, s] = slopes[s]
+    if seen > _FEWEST_REPEATED and fresh == 0:  # the camera has sent a frame again
+        return 0.0
     for s in range(m):
         used[s] = errors[s]
         if not (errors[s] < math.inf or slopes[s] != 0.0):  # 0 stands for a slope that is not known
@@ -127,7 +140,7 @@ class StuckWatch:
     """
 
     def __init__(self, slopes: int) -> None:
-        self._recent = np.full((_VALUES + 1, slopes), np.nan)
+        self._recent = np.full((_LATEST + 1, slopes), np.nan)
         self._recent[_VALUES] = 0.0
         self._sums, self._clock = np.zeros((_KEY + 1, slopes)), np.zeros(3)
         self._table = np.empty(2 * slopes, np.int64)
@@ -217,6 +230,35 @@ def followers(slopes: Floats) -> Mask:
         if key[other] - key[one] < _ALIKE and size[one] > 0 and size[other] > 0:
             alike[[one, other]] |= bool(np.abs(centred[:, one] - centred[:, other]).max() < 1e3 * _ALIKE)
     return np.asarray(alike.reshape(2, -1).any(axis=0))
+
+
+def silent_subapertures(slopes: Floats, steps: Floats) -> Mask:
+    """Return the sub-apertures whose slopes hardly take part in the steps that correct the wavefront, (n,).
+
+    Whatever law computed the steps, slopes of a wavefront are a part of them. If more than a quarter of the
+    sub-apertures seem to be silent, the matrix is another one, and none is returned.
+
+    Parameters
+    ----------
+    slopes : (frames, 2 n) array
+        NaN where not measured.
+    steps : (frames, 2 n) array
+        Steps of the commands that were computed from them, in slopes.
+    """
+    measured = np.isfinite(slopes)
+    sent, seen = np.where(measured, steps, 0.0), np.where(measured, slopes, 0.0)
+    power, size, product = (
+        (one * other).reshape(len(slopes), 2, -1).sum(axis=(0, 1))
+        for one, other in ((sent, sent), (seen, seen), (sent, seen))
+    )
+    known = power > 0
+    if not known.any():
+        return np.zeros(len(power), np.bool_)
+    response = np.where(known, product / np.where(known, power, 1.0), np.nan)
+    usual = float(np.nanmedian(response))
+    error = np.sqrt(size / np.maximum(power, 1e-300) / len(slopes))
+    silent = known & (np.abs(response) + _SURE * error < _SILENT * abs(usual))
+    return np.asarray(silent & (silent.mean() <= _MOST_ALIKE))
 
 
 def still_actuators(slopes: Floats, commands: Floats, interaction: Floats) -> Mask:

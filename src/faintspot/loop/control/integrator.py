@@ -255,14 +255,14 @@ def integrate_wavefront(
     ----------
     wavefront : (commands,) float32 or float64 array
         As the commands that cause it.
-    latest, command : (commands,) float64 array
-    gain, keep, largest : float
+    latest, command, largest : (commands,) float64 array
+    gain, keep : float
     """
     total = 0.0
     for c in range(command.shape[0]):
         value = keep * latest[c] - gain * wavefront[c]
         total += value
-        command[c] = min(max(value, -largest), largest)
+        command[c] = min(max(value, -largest[c]), largest[c])
     return total
 
 
@@ -278,7 +278,8 @@ def integrate(
         Finite.
     columns : (m, commands) float32 array, contiguous
         The reconstructor, transposed, see `add_products`. Reading it takes most of the time of large sensors.
-    gain, keep, largest : float
+    gain, keep : float
+    largest : (commands,) float64 array
     rows : (delay + 1, commands) float64 array
         Of a `CommandDelayLine`.
     next_row : int

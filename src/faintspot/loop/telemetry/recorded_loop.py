@@ -23,7 +23,13 @@ from faintspot.io.slopes import holds_slopes
 from faintspot.io.telemetry import read_telemetry
 from faintspot.io.zarr_store import holds_telemetry
 from faintspot.loop.control.configuration import RecordedControl, load_control, unpacked_control
-from faintspot.loop.control.identification.recording import NUMBERS, Recording, cells_of, rows_of_slopes
+from faintspot.loop.control.identification.recording import (
+    NUMBERS,
+    OFFSETS,
+    Recording,
+    cells_of,
+    rows_of_slopes,
+)
 from faintspot.loop.slope_covariance import ARCSEC
 from faintspot.loop.telemetry.recording import CLOSED
 from faintspot.slopes.recorded.stored_run import open_run
@@ -34,7 +40,10 @@ Floats = NDArray[np.float64]
 UNITS = {"px": None, "arcsec": 1.0, "rad": 1 / ARCSEC}
 """Units of slopes, in arcsec."""
 _OF_AOT = {"pix": "px", "pixel": "px", "px": "px", "arcsec": "arcsec", "rad": "rad"}
-_ARRAYS = ("slopes", "commands", "interaction_matrix", "control_matrix", "cells", "time_s", "frame", "flags")
+_ARRAYS = (
+    *("slopes", "commands", "interaction_matrix", "control_matrix", "cells", "time_s", "frame", "flags"),
+    *OFFSETS,
+)
 _OF_SENSOR = (
     *("frame", "cells", "diameter_m", "pixel_scale_arcsec", "subaperture_m"),
     *("commands", "control_matrix", "frame_rate_hz", "delay_frames"),
@@ -290,6 +299,9 @@ def _loop(name: str, values: dict[str, Any], given: list[str]) -> Recording:
     has_cells = not (isinstance(cells, str) and cells == _NO_CELLS)
     diameter_m = numbers.pop("diameter_m", None)
     known: dict[str, Any] = {**numbers, "pixel_scale_arcsec": scale, "frame_rate_hz": rate}
+    known |= {name: values.get(name) for name in OFFSETS}
+    if in_pairs and known["reference_slopes"] is not None:
+        known["reference_slopes"] = np.asarray(known["reference_slopes"]).reshape(-1, 2).T.ravel()
     loop = Recording(
         slopes,
         values.get("commands"),

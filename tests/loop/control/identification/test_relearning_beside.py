@@ -53,11 +53,11 @@ def test_residual_of_an_integrator_in_a_replay() -> None:
     sent = [np.zeros(1)]
 
     def control(slopes: np.ndarray) -> np.ndarray:
-        sent.append(sent[-1] - 0.2 * slopes[:1] / 3)
+        sent.append(sent[-1] - 0.2 * slopes[:1])
         return sent[-1]
 
     telemetry = OpenLoopTelemetry(open_loop, np.ones((50, 2)), np.ones((50, 2)))
-    left = replayed_slopes(control, telemetry, matrix, np.full(2, 1 / 3), 2)
+    left = replayed_slopes(control, telemetry, matrix, 2)
     np.testing.assert_allclose(left, expected, rtol=0.01)
 
 

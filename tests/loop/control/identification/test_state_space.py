@@ -31,6 +31,7 @@ from faintspot.loop.control.kalman.local_predictor import local_filter
 MANUAL = ROOT / "docs" / "guide" / "predictive_filter.md"
 NOISE_PX2 = np.full(18, 0.25)
 SCALE, SIGN, LIMIT = 3.0, -1.0, 0.7
+REFERENCE, FLAT = np.linspace(-1, 1, 18), np.linspace(40, 60, 12)
 DENSE = {
     "first": LAYERS.first,
     "second": LAYERS.second,
@@ -50,6 +51,7 @@ def model(request: pytest.FixtureRequest) -> Kalman:
 def exported(model: Kalman, path: Path) -> dict[str, Any]:
     matrices = state_space(model, PLANT, SCALE, SIGN)
     written = {**matrices, "delay_frames": np.array(2), "largest_command": np.array(LIMIT)}
+    written |= {"reference_slopes": REFERENCE, "flat_command": FLAT}
     write_matrices(path, written)
     return matrices
 
@@ -67,7 +69,8 @@ def test_the_lines_of_the_manual(model: Kalman, tmp_path: Path, monkeypatch: pyt
     for open_loop in telemetry(200).open_loop_px:
         slopes = (open_loop + INTERACTION @ line.acting) / SCALE
         alone.update(SCALE * slopes, np.sqrt(NOISE_PX2))
-        np.testing.assert_allclose(run["control"](slopes), SIGN * line.latest, rtol=0, atol=tolerance)
+        command = run["control"](slopes + REFERENCE) - FLAT
+        np.testing.assert_allclose(command, SIGN * line.latest, rtol=0, atol=tolerance)
         limited += int(np.abs(line.latest).max() == LIMIT)
     assert 0 < limited < 200
 
@@ -86,7 +89,7 @@ class Shared:
 
 
 class MilkLoop:
-    """Loop whose commands are those of the filter, within float32."""
+    """Loop whose commands are those of the filter, within float32: 4e-6 of 60."""
 
     def __init__(self, model: Kalman) -> None:
         self._line = CommandDelayLine(12, 2, LIMIT)
@@ -96,11 +99,11 @@ class MilkLoop:
     def slopes(self) -> np.ndarray:
         residual = next(self._rows) + INTERACTION @ self._line.acting
         self._alone.update(residual, np.sqrt(NOISE_PX2))
-        return np.asarray(residual / SCALE)[:, None]
+        return np.asarray(residual / SCALE + REFERENCE)[:, None]
 
     def send(self, command: np.ndarray) -> None:
         assert command.shape == (4, 3)
-        np.testing.assert_allclose(command.ravel(), SIGN * self._line.latest, rtol=0, atol=1e-6)
+        np.testing.assert_allclose(command.ravel() - FLAT, SIGN * self._line.latest, rtol=0, atol=1e-5)
         self.frames += 1
 
 

@@ -306,7 +306,6 @@ def replayed_slopes(
     control: Callable[[Floats], Floats],
     open_loop: OpenLoopTelemetry,
     matrix: Floats,
-    scale: Floats,
     delay: int,
 ) -> Floats:
     """Return the mean square of the residual slopes that commands control, frame by frame, (frames,).
@@ -314,13 +313,11 @@ def replayed_slopes(
     Parameters
     ----------
     control : callable
-        Command of a frame of slopes.
+        Command of a frame of slopes, which are NaN where not measured.
     open_loop : OpenLoopTelemetry
         Slopes without the mirror, with the noise of the recording.
     matrix : (m, commands) array
         Slopes of a unit of each command.
-    scale : (m,) array
-        Such slopes in a unit of the controller's.
     delay : int
         Frames.
     """
@@ -328,6 +325,6 @@ def replayed_slopes(
     squares, controlled = [], matrix @ make_reconstructor(matrix).clean
     for slopes, variance in zip(open_loop.open_loop_px, open_loop.variance_px2, strict=True):
         residual = slopes + matrix @ sent.popleft()
-        sent.append(control(np.where(np.isfinite(variance), residual, np.nan) / scale))
+        sent.append(control(np.where(np.isfinite(variance), residual, np.nan)))
         squares.append(float(np.square(controlled @ residual).mean()))
     return np.array(squares)

@@ -1,7 +1,7 @@
 """From a recording to the loop and the filter of a controller."""
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -62,6 +62,8 @@ class ObservedLoop:
     seen: OpenLoop
     identification: Identification | None = None
     """Identification of its open-loop slopes, if made already."""
+    recorded_interaction: Floats = field(default_factory=lambda: np.zeros((0, 0)))
+    """Interaction matrix of `ready` before it was corrected; or empty."""
 
 
 def learn_winds_again(recording: Recording, like: LoopOfControl) -> tuple[LoopOfControl, Kalman]:
@@ -127,7 +129,15 @@ def _with_winds(observed: ObservedLoop, start: Identified | None) -> tuple[LoopO
     loop, site = ready.recording, site_of_loop(ready.recording)
     gains, unit = delay.gains(len(loop.cells)), site.length_unit
     error = np.sqrt(seen.variance)
-    described = LoopOfControl.of(ready, delay, loop.interaction_matrix, error, gains, length_unit=unit)
+    described = LoopOfControl.of(
+        ready,
+        delay,
+        loop.interaction_matrix,
+        error,
+        gains,
+        length_unit=unit,
+        recorded_interaction=observed.recorded_interaction,
+    )
     learnt = learn_controller(
         described.plant(),
         seen.telemetry,
@@ -155,7 +165,8 @@ def _corrected(
             again = _observed(observed.ready._replace(recording=mended))
         except InputError:  # the gain cannot be measured with that matrix
             break
-        observed, (described, learnt) = again, _with_winds(again, start)
+        observed = replace(again, recorded_interaction=loop.interaction_matrix)
+        described, learnt = _with_winds(observed, start)
     return observed, described, learnt
 
 
@@ -185,7 +196,7 @@ def _controlling(
         described = replace(described, recorded_gain=max(recorded, 1e-9) * gain)
         remarks.append(f"fallback integrator: gain {advised:.2g}, as the recorded {recorded:.2g} leaves more")
     described = replace(
-        described, largest_command=_largest_command(loop, seen, plant), integrator_gain=advised
+        described, largest_command=_largest_command(ready, seen, plant), integrator_gain=advised
     )
     description = "; ".join([learnt.description, *remarks])
     return described, replace(learnt, plain_gain=plain * gain, description=description)
@@ -207,9 +218,12 @@ def _advised_gain(best: float, gain: float, gain_error: float, delay_frames: int
     return min(best / gain, most / (gain + (gain_error if math.isfinite(gain_error) else 0.0)))
 
 
-def _largest_command(loop: Recording, seen: OpenLoop, plant: LoopPlant) -> float:
-    """Return the stroke limit: the loop's, or 5 sigma of what the recorded wavefront asks for."""
+def _largest_command(ready: Prepared, seen: OpenLoop, plant: LoopPlant) -> Floats:
+    """Return stroke limits: what the loop's leaves, or 5 sigma of what the recorded wavefront asks for."""
+    loop, flat = ready.recording, ready.flat_command
     asked = seen.telemetry.open_loop_px @ plant.reconstructor.matrix.T
     static = np.abs(loop.commands.mean(axis=0)) * loop.interaction_matrix.any(axis=0)
-    limit = float((static + _MOST_SIGMAS * asked.std(axis=0)).max())
-    return limit if loop.largest_command is None else min(limit, loop.largest_command)
+    limit = np.full(len(static), float((static + _MOST_SIGMAS * asked.std(axis=0)).max()))
+    if loop.largest_command is not None:
+        limit = np.minimum(limit, np.maximum(loop.largest_command - np.abs(flat), 0.0))
+    return limit

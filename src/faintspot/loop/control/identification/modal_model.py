@@ -64,7 +64,8 @@ class LoopOfControl:
     """(6,): delay in frames, centroid gain, and that of x relative to y, each with its standard error."""
     winds: Floats
     """(layers, 6): speed, direction and share, each with its standard error."""
-    largest_command: float
+    largest_command: Floats
+    """(commands,): stroke limit about the flat command."""
     integrator_gain: float
     sent_after_frames: int
     recorded_gain: float = math.nan
@@ -75,6 +76,12 @@ class LoopOfControl:
     """Name of the law by which the recorded loop ran."""
     analysis: Floats = field(default_factory=lambda: np.zeros((0, 0)))
     """(modes, m): matrix from such slopes to modes, of which `interaction` then has a row each; or empty."""
+    recorded_interaction: Floats = field(default_factory=lambda: np.zeros((0, 0)))
+    """(2 n, commands): `interaction` before it was corrected, for the fallback; or empty."""
+    reference_slopes: Floats = field(default_factory=lambda: np.zeros(1))
+    """(m,) or (1,): slopes that are 0 here, in the user's unit."""
+    flat_command: Floats = field(default_factory=lambda: np.zeros(1))
+    """(commands,) or (1,): command that is 0 here, in the user's unit."""
     recorded: Recording | None = None
     """A frame of the recorded loop, in the user's units: what learning again must know."""
 
@@ -109,9 +116,11 @@ class LoopOfControl:
             ready.sign,
             delay.row(),
             np.zeros((0, 6)),
-            math.inf,
+            np.full(matrix.shape[1], math.inf),
             math.nan,
             ready.sent_after_frames,
+            reference_slopes=ready.reference_slopes,
+            flat_command=ready.flat_command,
             recorded=loop.part(slice(0, 1)).scaled(1 / loop.unit),
             **options,
         )
@@ -146,6 +155,18 @@ class LoopOfControl:
         frame: dict[str, Any] = {"slopes": np.zeros((1, slopes)), "commands": np.zeros((1, commands))}
         return replace(loop, recorded=Recording(**frame, **known))
 
+    def scaled_slopes(self, slopes: Floats) -> Floats:
+        """Return slopes of this loop from the user's."""
+        return (slopes - self.reference_slopes) * self.scale
+
+    def sent(self, command: Floats) -> Floats:
+        """Return the user's command from one of this loop."""
+        return self.sign * command + self.flat_command
+
+    def held(self, command: Floats) -> Floats:
+        """Return the command of this loop from the user's."""
+        return self.sign * (command - self.flat_command)
+
     @property
     def slopes_of_commands(self) -> Floats:
         """(m, commands): the user's matrix in such slopes.
@@ -166,9 +187,11 @@ class LoopOfControl:
         if self.analysis.size:
             return LoopPlant(self.interaction, make_reconstructor(self.interaction), frames, _LEAK)
         reconstructor = make_reconstructor(self.interaction, measured=np.isfinite(self.standard_error))
-        # The integrator is that of the recording, whatever gain of x relative to y was found.
-        gains = np.exp(np.log(np.abs(self.scale)).mean()) / np.abs(self.scale)
-        reconstructor = replace(reconstructor, matrix=reconstructor.matrix * gains)
+        # The integrator is that of the recording, whatever gain of x relative to y, or mirror, was found.
+        plain, gains = reconstructor, np.exp(np.log(np.abs(self.scale)).mean()) / np.abs(self.scale)
+        if self.recorded_interaction.size:
+            plain = make_reconstructor(self.recorded_interaction, measured=np.isfinite(self.standard_error))
+        reconstructor = replace(reconstructor, matrix=plain.matrix * gains)
         return LoopPlant(self.interaction, reconstructor, frames, _LEAK)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -128,14 +129,14 @@ class PredictiveControl:
         Parameters
         ----------
         command : (commands,) array, optional
-            What the mirror holds. Default: it is flat.
+            What the mirror holds. Default: the recording's mean, or stated, `flat_command`.
         """
         plant, limit = self._plant, self._loop.largest_command
         self._line = CommandDelayLine(plant.interaction.shape[1], plant.delay_frames, limit)
         self._controller = self.model.guarded(plant, self._line, plain_frames=_MEASURED_FRAMES)
         self._eased = 0 if self._loop.recorded_gain > 0 else _EASED_FRAMES
         if command is not None:
-            self._line.hold(self._loop.sign * np.asarray(command, np.float64))
+            self._line.hold(self._loop.held(np.asarray(command, np.float64)))
             self._controller.begin()
         self._recent.clear()
         self._waited = self._since_loss = 0
@@ -154,7 +155,7 @@ class PredictiveControl:
         ----------
         slopes : (2 n,) array
             Residual slopes as in the recording. Not measured: NaN, infinite, or over 1000 times the rms of
-            those.
+            those; and a row of zeros.
         standard_errors : (2 n,) array, optional
             Standard errors of the slopes; not measured unless positive. Default: the noise of the recording.
 
@@ -166,9 +167,12 @@ class PredictiveControl:
         if self._relearn:
             self._learn_beside()
         loop = self._loop
-        scaled, errors = self._row("slopes", slopes), loop.standard_error
+        errors = loop.standard_error
+        with np.errstate(over="ignore"):
+            row = self._row("slopes", slopes)
+            scaled = loop.scaled_slopes(row if row.any() else np.full_like(row, np.nan))
         if standard_errors is not None:
-            stated = self._row("standard_errors", standard_errors)
+            stated = self._row("standard_errors", standard_errors) * loop.scale
             errors = np.where((stated > 0) & np.isfinite(errors), stated, np.inf)
         measured = np.abs(scaled) < _ABSURD
         if not measured.all():  # NaN among them
@@ -178,7 +182,7 @@ class PredictiveControl:
             part, plain = self._eased / _EASED_FRAMES, self.model.plain_gain
             self._controller.set_plain_gain(loop.recorded_gain ** (1 - part) * plain**part)
         self._controller.update(*self._controlled(scaled, errors))
-        command = loop.sign * self._line.latest
+        command = loop.sent(self._line.latest)
         if errors is not loop.standard_error:  # else only what is never measured is missing
             scaled = np.where(np.isfinite(errors), scaled, np.nan)
         self._recent.add(scaled, command)
@@ -229,7 +233,7 @@ class PredictiveControl:
         loop = self._loop
         slopes, commands = self._recent.latest(frames)
         scale: Singles = np.where(np.isfinite(loop.standard_error), loop.scale, np.nan).astype(np.float32)
-        return np.divide(slopes, scale, dtype=np.float32), commands
+        return (slopes / scale + loop.reference_slopes).astype(np.float32), commands
 
     def recording_of(self, slopes: ArrayLike, commands: ArrayLike) -> Recording:
         """Return frames of this controller's loop, (frames, m) and (frames, commands), as a recording.
@@ -242,8 +246,16 @@ class PredictiveControl:
         if self._loop.recorded is None:
             raise InputError("controller: expected the recorded loop in its file; learn from a recording")
         delay = float(self._plant.delay_frames)
-        frames = replace(self._loop.recorded, slopes=slopes, commands=commands, frame=None)
-        return replace(frames, delay_frames=delay, sent_after_frames=0)
+        return replace(
+            self._loop.recorded,
+            slopes=slopes,
+            commands=commands,
+            frame=None,
+            reference_slopes=self._loop.reference_slopes,
+            flat_command=self._loop.flat_command,
+            delay_frames=delay,
+            sent_after_frames=0,
+        )
 
     def better_of(self, recording: Recording) -> tuple[PredictiveControl | None, str]:
         """Learn from the first part of a recording, and compare with this controller on the rest, by replay.
@@ -271,12 +283,11 @@ class PredictiveControl:
         loop, begin = new._loop, max(0, first - SETTLE_FRAMES)
         rest, delay = recording.part(slice(begin, None)), new._plant.delay_frames
         matrix = loop.slopes_of_commands
-        corrected = {"slopes": rest.slopes * loop.scale, "commands": loop.sign * rest.commands}
-        rest = replace(rest, **corrected, interaction_matrix=matrix)
+        slopes, commands = loop.scaled_slopes(rest.slopes), loop.held(rest.commands)
+        rest = replace(rest, slopes=slopes, commands=commands, interaction_matrix=matrix)
         seen = open_loop_of(rest, LoopDelay(float(delay), 0.0, 1.0, 0.0)).telemetry
-        in_loop = seen, loop.sign * matrix, loop.scale, delay
         left = [
-            replayed_slopes(control, *in_loop)[first - begin :]
+            replayed_slopes(control._in_loop_of(loop), seen, matrix, delay)[first - begin :]
             for control in (new, PredictiveControl(self._loop, self.model))
         ]
         ratio, error = left[0].mean() / left[1].mean(), error_of_mean(left[1] - left[0]) / left[1].mean()
@@ -285,34 +296,36 @@ class PredictiveControl:
         is_better = 1 - ratio > STANDARD_ERRORS * error
         return (new if is_better else None), f"{text}, {'taken' if is_better else 'not taken'}"
 
+    def _in_loop_of(self, loop: LoopOfControl) -> Callable[[Floats], Floats]:
+        """Return this controller for the slopes and commands of a description of the same loop."""
+        return lambda slopes: loop.held(self(slopes / loop.scale + loop.reference_slopes))
+
     def _take(self, better: PredictiveControl) -> None:
         """Continue with another controller from the mirror's command."""
-        latest = self._loop.sign * self._line.latest
+        latest = self._loop.sent(self._line.latest)
         self._loop, self._plant, self.model = better._loop, better._plant, better.model
         self._line, self._controller, self._eased = better._line, better._controller, _EASED_FRAMES
-        self._line.hold(self._loop.sign * latest)
+        self._line.hold(self._loop.held(latest))
         self._controller.begin()
         self._recent.clear()
         self._waited = self._since_loss = 0
 
     def _row(self, name: str, values: ArrayLike) -> Floats:
-        """Return values of all slopes, scaled.
+        """Return values of all slopes as numbers.
 
         Raises
         ------
         InputError
             When they have another shape.
         """
-        scale = self._loop.scale
         try:
             hides = np.ma.isMaskedArray(values) or np.iscomplexobj(values)
             row = np.asarray(real_array(name, values) if hides else values, np.float64)
         except (TypeError, ValueError):
             row = real_array(name, values).astype(np.float64)
-        if row.shape != scale.shape:
-            raise InputError(f"expected shape {scale.shape}, got {row.shape}", name=name)
-        with np.errstate(over="ignore"):
-            return row * scale
+        if row.shape != self._loop.scale.shape:
+            raise InputError(f"expected shape {self._loop.scale.shape}, got {row.shape}", name=name)
+        return row
 
     def learn_again(self, recording: Recording | None = None) -> PredictiveControl:
         """Learn from another recording of the same loop, from the turbulence known so far; return itself.
@@ -373,7 +386,7 @@ class PredictiveControl:
         Of more than 300 slopes those of the state are sparse.
 
         The names are those of `state_space`, with `delay_frames` and `largest_command`; slopes and commands
-        are in the unit and of the sign of the recording.
+        are in the unit and of the sign of the recording, less `reference_slopes` and `flat_command`.
 
         Parameters
         ----------
@@ -389,7 +402,9 @@ class PredictiveControl:
         scale = loop.analysis * loop.scale if loop.analysis.size else loop.scale
         matrices = state_space(self.model, plant, scale, loop.sign)
         matrices["delay_frames"] = np.array(plant.delay_frames)
-        write_matrices(path, {**matrices, "largest_command": np.array(loop.largest_command)})
+        for name in ("largest_command", "reference_slopes", "flat_command"):
+            matrices[name] = np.asarray(getattr(loop, name))
+        write_matrices(path, matrices)
 
     def summary(self) -> str:
         """Return a summary of one line."""

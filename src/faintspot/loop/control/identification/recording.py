@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.signal import csd, welch
 
 from faintspot.base.checks import (
     finite_array,
@@ -20,7 +21,13 @@ from faintspot.base.checks import (
 )
 from faintspot.base.errors import InputError
 from faintspot.base.options import Option
-from faintspot.loop.control.faults import followers, rows_without_measurement, still_actuators, stuck_slopes
+from faintspot.loop.control.faults import (
+    followers,
+    rows_without_measurement,
+    silent_subapertures,
+    still_actuators,
+    stuck_slopes,
+)
 from faintspot.loop.control.reconstructor import make_reconstructor
 from faintspot.loop.slope_covariance import modes_of_turbulence, order_remark
 
@@ -28,15 +35,22 @@ Floats = NDArray[np.float64]
 
 _MOST_SENT_AFTER = 5  # frames
 _CLEAR = 0.5  # correlation of an integrator's steps with its slopes, above which their rows are known
-_UNRELATED = 0.1  # correlation below which commands are not those of the loop
+_UNRELATED = 0.1  # coherence below which commands are not those of the loop
+_WINDOW, _SLOW, _INDEPENDENT = 64, 16, 0.75  # frames; part of them; part of half-overlapping pieces
+_IN_PHASE, _MOST_COMPARED = 0.4, 200  # part that tells the sign; slopes
 _STEPS_FOR_TEST = 200  # fewest of them
 _PER_FRAME = ("slopes", "commands", "frame", "standard_errors", "covariance_xy")
-_ARRAYS = ("slopes", "commands", "interaction_matrix", "standard_errors", "covariance_xy", "prior_std")
+OFFSETS = "reference_slopes", "flat_command"
+_ARRAYS = (
+    *("slopes", "commands", "interaction_matrix", "standard_errors", "covariance_xy", "prior_std"),
+    *OFFSETS,
+)
 _MOST_CELLS = 1000  # rows or columns of the lenslet array
 _REGULAR = 0.9  # least part of the gaps between exposures that are whole numbers of exposures
 _NAMED = 5  # sub-apertures in a remark
 _BROKEN = 1e6  # rms of a slope relative to the median one
 _LARGEST = 1e30  # whose square is a number
+_PARTS, _MANY_ERRORS = 16, 10.0  # of a recording; standard errors of a mean that is not 0
 
 
 def _number(meaning: str, unit: str, low: float, high: float, *, whole: bool = False) -> Option:
@@ -53,6 +67,7 @@ NUMBERS = {
     "gain_error": _number("Relative error of the centroid gain of an open loop.", "", 1e-6, 10.0),
     "outer_scale_m": _number("Outer scale of the turbulence.", "m", 1e-2, 1e6),
     "science_wavelength_m": _number("Wavelength of the Strehl ratio.", "m", 1e-8, 1e-3),
+    "command_sign": _number("1: commands add to the slopes; -1: they are subtracted.", "", -1, 1, whole=True),
     "sent_after_frames": _number("Frames from a command's slopes to its row.", "", 0, 100, whole=True),
 }
 """Numbers that describe a recording, by name."""
@@ -62,7 +77,7 @@ NUMBERS = {
 class Recording:
     """Slopes and commands of consecutive frames of a loop; None if unknown.
 
-    Commands may add to the slopes of the turbulence or be subtracted from them. With `cells`, the slopes are
+    With `cells`, the slopes are
     those of n sub-apertures; without, any measurements of the wavefront, such as those of a pyramid.
 
     Raises
@@ -91,6 +106,8 @@ class Recording:
     sent_after_frames: int | None = None
     """Row k holds the command computed from frame k minus this: 0 before a delay line, more after it.
     Default: found from the steps of the commands, which follow the slopes."""
+    command_sign: float | None = None
+    """1 where commands add to the slopes of the turbulence, -1 where they are subtracted. Default: found."""
     frame: Any = None
     """(frames,): number of each frame; missing ones were lost. Default: none was lost."""
     standard_errors: Any = None
@@ -99,7 +116,12 @@ class Recording:
     """(frames, n): covariance of the errors of x and y. Default: 0."""
     prior_std: Any = None
     """(2 n,): width of the estimator's prior, of which the slopes have been freed. Default: it had none."""
+    reference_slopes: Any = None
+    """(2 n,): slopes at which the loop holds. Default: the mean of a closed loop if clearly not 0."""
+    flat_command: Any = None
+    """(commands,): command about which the mirror is controlled. Default: as of the reference slopes."""
     largest_command: float | None = None
+    """Limit of all commands as recorded, either way."""
     gain_error: float | None = None
     """Relative error of the centroid gain of an open loop, which is 1. Default: 0."""
     outer_scale_m: float | None = None
@@ -127,6 +149,8 @@ class Recording:
         for name, declared in NUMBERS.items():
             if hasattr(self, name):
                 values[name] = declared.checked(name, getattr(self, name))
+        if values["command_sign"] == 0:
+            raise InputError("expected 1 or -1", name="command_sign", value=0)
         for name in ("frame_rate_hz", "science_wavelength_m"):
             if values[name] is None:
                 raise InputError("expected a number", name=name, value=None)
@@ -138,10 +162,11 @@ class Recording:
             if getattr(self, name) is not None:
                 array = finite_array(name, getattr(self, name), minimum_dimensions=2).astype(np.float64)
                 values[name] = array.reshape(len(array), -1)
-        for name in ("standard_errors", "covariance_xy", "prior_std"):
+        for name in ("standard_errors", "covariance_xy", "prior_std", *OFFSETS):
             if getattr(self, name) is not None:
-                values[name] = real_array(name, getattr(self, name)).astype(np.float64)
-                if name != "covariance_xy" and (values[name] < 0.0).any():
+                check = finite_array if name in OFFSETS else real_array
+                values[name] = check(name, getattr(self, name)).astype(np.float64)
+                if name in ("standard_errors", "prior_std") and (values[name] < 0.0).any():
                     raise InputError(f"{name}: expected no negative numbers")
         for name in _ARRAYS:
             array = np.abs(values.get(name, np.zeros(0)))
@@ -160,8 +185,11 @@ class Recording:
         for name in ("covariance_xy", "prior_std") if self.cells is None else ():
             if getattr(self, name) is not None:
                 raise InputError(f"{name}: expected none without cells, got an array; give cells")
-        shapes = {"standard_errors": (frames, slopes), "covariance_xy": (frames, slopes // 2)}
-        for name, shape in {**shapes, "prior_std": (slopes,)}.items():
+        shapes: dict[str, tuple[int, ...]] = dict.fromkeys(("prior_std", "reference_slopes"), (slopes,))
+        shapes |= {"standard_errors": (frames, slopes), "covariance_xy": (frames, slopes // 2)}
+        if self.commands is not None:
+            shapes |= {"flat_command": self.commands.shape[1:]}
+        for name, shape in shapes.items():
             if getattr(self, name) is not None and getattr(self, name).shape != shape:
                 raise InputError(f"{name}: expected shape {shape}, got {getattr(self, name).shape}")
         if self.commands is None or self.interaction_matrix is None:
@@ -177,7 +205,7 @@ class Recording:
 
     def scaled(self, unit: float) -> Recording:
         """Return the same loop with slopes in another unit, so many of the present one."""
-        powers = {name: 1 for name in _ARRAYS if name != "commands"} | {"covariance_xy": 2}
+        powers = {name: 1 for name in _ARRAYS if "command" not in name} | {"covariance_xy": 2}
         arrays = {name: getattr(self, name) for name in powers}
         scaled = {name: array / unit ** powers[name] for name, array in arrays.items() if array is not None}
         scale = self.pixel_scale_arcsec
@@ -195,10 +223,14 @@ class Prepared(NamedTuple):
     sent_after_frames: int
     loop_gain: float
     """Gain of the integrator that computed the commands; infinite if another controller did."""
+    reference_slopes: Floats
+    """(m,): slopes of the original that are 0 here, in `slope_unit`."""
+    flat_command: Floats
+    """(commands,): command of the original that is 0 here; without commands empty."""
 
 
 def prepared(recording: Recording) -> Prepared:
-    """Bring a recording to one convention of sign, rows and unit.
+    """Bring a recording to one convention of sign, rows, unit and offsets.
 
     Raises
     ------
@@ -210,20 +242,56 @@ def prepared(recording: Recording) -> Prepared:
     slopes = recording.slopes[np.isfinite(recording.slopes)]
     if not slopes.size:
         raise InputError(f"{recording.name}: expected slopes, got none that were measured")
-    spread = float(slopes.std())
-    if not spread > 1e-12 * float(np.abs(slopes).max(initial=0.0)):
+    if not float(np.ptp(slopes)) > 1e-12 * float(np.abs(slopes).max()):
         raise InputError(f"{recording.name}: expected slopes that vary, got constant ones")
     _check_alike(recording)
-    scaled = _without_unmeasured(recording).scaled(spread)
+    centred, reference, flat = _about_offsets(_without_unmeasured(recording))
+    scaled = centred.scaled(float(np.nanstd(centred.slopes)))
+    offsets = recording.unit * reference, flat
     moves = scaled.commands is not None and np.ptp(scaled.commands, axis=0).any()
     if (moves or not scaled.is_closed) and (doubt := order_doubt(scaled)):
         scaled = replace(scaled, remarks=(*scaled.remarks, doubt))
     if not recording.is_closed:
-        return Prepared(scaled, 1.0, 0, math.inf)
+        return Prepared(scaled, 1.0, 0, math.inf, *offsets)
     if recording.commands is None or recording.interaction_matrix is None:
-        return Prepared(scaled, 1.0, 0, math.inf)
-    ready = _with_convention(scaled)
-    return ready._replace(recording=_without_still_actuators(ready.recording))
+        return Prepared(scaled, 1.0, 0, math.inf, *offsets)
+    loop, sign, sent, loop_gain = _with_convention(scaled)
+    ready = _without_still_actuators(_without_silent_subapertures(loop))
+    return Prepared(ready, sign, sent, loop_gain, *offsets)
+
+
+def _about_offsets(recording: Recording) -> tuple[Recording, Floats, Floats]:
+    """Return a recording less its reference slopes and flat command, and these, with remarks on means.
+
+    An open loop is not about its means, which belong to the wavefront.
+    """
+    names = {"reference_slopes": "slopes", "flat_command": "commands"}
+    values: dict[str, Any] = {}
+    offsets, remarks = [], []
+    for name, of in names.items():
+        array, offset = getattr(recording, of), getattr(recording, name)
+        if array is None:
+            array = np.zeros((len(recording.slopes), 0))
+        elif offset is None and recording.is_closed and (mean := _mean(array)).any():
+            offset, rms = mean, float(np.sqrt(np.square(mean).mean()))
+            remarks.append(f"{name.replace('_', ' ')}: the mean of the {of}, {rms:.3g} rms, is subtracted")
+        offsets.append(np.zeros(array.shape[1]) if offset is None else offset)
+        values |= {name: None, of: None if getattr(recording, of) is None else array - offsets[-1]}
+    centred = replace(recording, remarks=(*recording.remarks, *remarks), **values)
+    return centred, offsets[0], offsets[1]
+
+
+def _mean(values: Floats) -> Floats:
+    """Return means of columns, the medians of those of parts; 0 unless they are clearly not."""
+    starts = np.linspace(0, len(values), min(_PARTS, len(values)), endpoint=False).astype(int)
+    known = np.isfinite(values)
+    counts = np.add.reduceat(known.astype(np.int64), starts)
+    sums = np.add.reduceat(np.where(known, values, 0.0), starts)
+    whole = sums.sum(axis=0) / np.maximum(counts.sum(axis=0), 1)
+    means = np.where(counts > 0, sums / np.maximum(counts, 1), whole)
+    mean, error = np.median(means, axis=0), means.std(axis=0) / math.sqrt(len(starts))
+    in_errors = np.abs(mean[error > 0]) / error[error > 0]
+    return mean if in_errors.size and np.median(in_errors) > _MANY_ERRORS else np.zeros_like(mean)
 
 
 def _exposures(recording: Recording) -> Recording:
@@ -335,6 +403,20 @@ def _without_still_actuators(loop: Recording) -> Recording:
     return replace(loop, interaction_matrix=matrix, remarks=(*loop.remarks, remark))
 
 
+def _without_silent_subapertures(loop: Recording) -> Recording:
+    """Return a recording without the sub-apertures whose slopes the commands do not answer, with a remark."""
+    if loop.cells is None:
+        return loop
+    steps = np.diff(loop.commands, axis=0) @ loop.interaction_matrix.T
+    steps[np.diff(loop.frame) != 1] = 0.0
+    silent = silent_subapertures(loop.slopes[1:], steps)
+    if not silent.any():
+        return loop
+    slopes = np.where(np.tile(silent, 2), np.nan, loop.slopes)
+    remark = f"{_named(silent, loop.cells)}: slopes are unlike those that the mirror corrects"
+    return replace(loop, slopes=slopes, remarks=(*loop.remarks, remark))
+
+
 def _named(mask: NDArray[np.bool_], cells: NDArray[np.int64]) -> str:
     """Return sub-apertures with row and column as text."""
     numbers = np.flatnonzero(mask)
@@ -347,26 +429,38 @@ def _first_ones(values: Sequence[object] | NDArray[np.int64]) -> str:
     return f"{', '.join(map(str, values[:_NAMED]))}{more}"
 
 
-def _with_convention(loop: Recording) -> Prepared:
-    """Return a closed loop whose commands add, in the rows of the frames that they were computed from."""
+def _with_convention(loop: Recording) -> tuple[Recording, float, int, float]:
+    """Return a closed loop whose commands add, in the rows of the frames that they were computed from.
+
+    Then sign, rows and gain, see `Prepared`.
+    """
     if not np.ptp(loop.commands, axis=0).any():
-        return Prepared(loop, 1.0, 0, math.inf)
+        return loop, 1.0, 0, math.inf
     stated, remarks = loop.sent_after_frames, list(loop.remarks)
-    correlations, gains = _steps_on_slopes(loop)
+    controlled, caused = _controlled(loop)
+    correlations, gains = _steps_on_slopes(controlled, caused, loop.frame)
     clearest = int(np.argmax(np.abs(correlations)))
     largest = float(np.abs(correlations[clearest]))
-    if len(loop.slopes) > _STEPS_FOR_TEST and largest < _UNRELATED:
-        raise InputError(
-            f"commands: expected commands computed from the slopes, got steps with a correlation of "
-            f"{largest:.2f} with them; check that both are of one loop and the interaction matrix is its own"
-        )
+    if len(loop.slopes) > _STEPS_FOR_TEST and largest < _CLEAR:
+        coherence, in_phase = _coherence(controlled, caused)
+        if coherence < _UNRELATED:
+            raise InputError(
+                f"commands: expected commands computed from the slopes, got a coherence of {coherence:.2f} "
+                "with them; check that both are of one loop and the interaction matrix is its own"
+            )
+        if abs(in_phase) < _IN_PHASE and loop.command_sign is None:
+            raise InputError(
+                "commands: their sign cannot be known from the slopes; state command_sign, 1 where commands "
+                "add to the slopes, -1 where they are subtracted"
+            )
+        correlations = np.full_like(correlations, in_phase)
     sent = stated if stated is not None else clearest if largest >= _CLEAR else 0
     if stated is None and sent:
         remarks.append(f"commands: computed {sent} frames before the row in which they are recorded")
     if stated is not None and largest >= _CLEAR and clearest != stated:
         remarks.append(f"sent_after_frames is {stated}, but the commands follow the slopes after {clearest}")
     loop_gain = abs(float(gains[min(sent, _MOST_SENT_AFTER)]))
-    sign = -1.0 if correlations[min(sent, _MOST_SENT_AFTER)] > 0 else 1.0
+    sign = loop.command_sign or (-1.0 if correlations[min(sent, _MOST_SENT_AFTER)] > 0 else 1.0)
     if sign < 0:
         remarks.append("commands: sign reversed, as they are subtracted from the turbulence")
     rows = np.searchsorted(loop.frame, loop.frame + sent)
@@ -378,21 +472,41 @@ def _with_convention(loop: Recording) -> Prepared:
         remarks=tuple(remarks),
         sent_after_frames=0,
     )
-    return Prepared(moved, sign, sent, loop_gain if largest >= _CLEAR else math.inf)
+    return moved, sign, sent, loop_gain if largest >= _CLEAR else math.inf
 
 
-def _steps_on_slopes(loop: Recording) -> tuple[Floats, Floats]:
+def _controlled(loop: Recording) -> tuple[Floats, Floats]:
+    """Return the part of the slopes that commands can correct, and the slopes of these, without means."""
+    reconstructor = make_reconstructor(loop.interaction_matrix)
+    controlled = np.nan_to_num(loop.slopes) @ reconstructor.matrix.T @ loop.interaction_matrix.T
+    caused = loop.commands @ loop.interaction_matrix.T
+    return controlled - controlled.mean(axis=0), caused - caused.mean(axis=0)
+
+
+def _coherence(controlled: Floats, caused: Floats) -> tuple[float, float]:
+    """Return the coherence of slopes and commands beyond chance, and what part of it is in phase.
+
+    The latter is of slow changes, before delays matter: negative where commands oppose the slopes.
+    """
+    moving = np.flatnonzero(controlled.any(axis=0) & caused.any(axis=0))[:_MOST_COMPARED]
+    one, other = controlled[1:, moving].T, np.diff(caused[:, moving], axis=0).T
+    pieces = max(2, 2 * one.shape[1] // _WINDOW - 1)
+    crossed = csd(one, other, nperseg=_WINDOW)[1][:, 1:]
+    power = welch(one, nperseg=_WINDOW)[1][:, 1:] * welch(other, nperseg=_WINDOW)[1][:, 1:]
+    coherency = crossed / np.sqrt(np.maximum(power, 1e-300))
+    slow = coherency[:, : _WINDOW // _SLOW]
+    in_phase = float(slow.real.sum() / max(float(np.abs(slow).sum()), 1e-300))
+    return float(np.square(np.abs(coherency)).mean()) - 1 / (_INDEPENDENT * pieces), in_phase
+
+
+def _steps_on_slopes(controlled: Floats, caused: Floats, frame: NDArray[np.int64]) -> tuple[Floats, Floats]:
     """Return correlations of slopes with steps of the commands 0, 1, ... rows later, and regressions.
 
     Steps are regressed on the command before, too, as a leak takes a part of it.
     """
-    reconstructor = make_reconstructor(loop.interaction_matrix)
-    controlled = np.nan_to_num(loop.slopes) @ reconstructor.matrix.T @ loop.interaction_matrix.T
-    controlled -= controlled.mean(axis=0)
-    caused = (loop.commands - loop.commands.mean(axis=0)) @ loop.interaction_matrix.T
     before = np.vstack([caused[:1], caused[:-1]])
     steps = caused - before
-    is_first = np.diff(loop.frame, prepend=loop.frame[0] - 1) != 1
+    is_first = np.diff(frame, prepend=frame[0] - 1) != 1
     steps[is_first] = before[is_first] = 0.0
     correlations, regressions = [], []
     for lag in range(_MOST_SENT_AFTER + 1):

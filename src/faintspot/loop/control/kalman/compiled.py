@@ -98,7 +98,7 @@ class CompiledKalman(GuardedController):
             np.zeros((SLOPE_ROWS, slopes)),
             np.zeros((COMMAND_ROWS, commands)),
         )
-        self._numbers = float(plain_gain), 1.0 - plant.leak, float(line.largest), steps
+        self._numbers = float(plain_gain), 1.0 - plant.leak, line.largest, steps
         self._std_px, self._shares = predictor.std_px, shares(predictor.model)
         self._independent = np.zeros(slopes // 2)
         self._is_behind = False
@@ -160,7 +160,9 @@ class CompiledKalman(GuardedController):
         self._memory.state[:], self._memory.slopes[PREDICTED] = 0.0, 0.0
         line = np.zeros_like(self._rows.learnt)
         recorded = Recorded(slopes, variance, covariance, trust)
-        replay(recorded, self._numbers[-1], self._matrices, line, self._memory, squares)
+        gain, keep, largest, steps = self._numbers
+        numbers = gain, keep, np.full_like(largest, np.inf), steps
+        replay(recorded, numbers, self._matrices, line, self._memory, squares)
         return squares
 
     def complete(self) -> None:

@@ -225,7 +225,7 @@ def _filter(matrices: Any, memory: Any, steps: Any, largest: Any, command: Any) 
     add_products(matrices.command, state, product)
     for c in range(command.shape[0]):
         total += product[0, c]
-        command[c] = min(max(product[0, c], -largest), largest)
+        command[c] = min(max(product[0, c], -largest[c]), largest[c])
     return total
 
 
@@ -252,8 +252,8 @@ def _send(command: Any, true: Any, row: Any, memory: Any, largest: Any) -> None:
     share = guard[BLENDED] / HANDOVER_FRAMES
     guard[AT_LIMIT] = 0.0
     for c in range(command.shape[0]):
-        true[row, c] = min(max(command[c] + share * offset[c], -largest), largest)
-        if abs(true[row, c]) >= largest:
+        true[row, c] = min(max(command[c] + share * offset[c], -largest[c]), largest[c])
+        if abs(true[row, c]) >= largest[c]:
             guard[AT_LIMIT] += 1.0
 
 
@@ -302,7 +302,7 @@ def follow(frame: Any, numbers: Any, matrices: Any, lines: Any, next_rows: Any, 
     Parameters
     ----------
     frame : Frame
-    numbers : (float, float, float, int)
+    numbers : (float, float, (commands,) array, int)
         The integrator's gain, what it keeps of its command, stroke, steps of conjugate gradients.
     matrices, lines, next_rows, memory
         As for `hold`, which was called before.
@@ -360,15 +360,14 @@ def _adopt(lines: Any, next_rows: Any, guard: Any) -> None:
 
 
 @_compiled
-def replay(recorded: Any, steps: Any, matrices: Any, line: Any, memory: Any, squares: Any) -> None:
+def replay(recorded: Any, numbers: Any, matrices: Any, line: Any, memory: Any, squares: Any) -> None:
     """Write the squared residual that the filter alone would have left in each recorded frame.
 
     Parameters
     ----------
     recorded : Recorded
-    steps : int
-        Of conjugate gradients.
-    matrices : Matrices
+    numbers, matrices
+        As for `follow`.
     line : (delay + 1, commands) float64 array
         Zeros.
     memory : Memory
@@ -376,6 +375,7 @@ def replay(recorded: Any, steps: Any, matrices: Any, line: Any, memory: Any, squ
         Infinite from the first command on that is not finite.
     """
     open_loop, variance, covariance, trust = recorded
+    _, _, largest, steps = numbers
     rows, delay = memory.slopes, line.shape[0] - 1
     squares[:] = math.inf
     for frame in range(open_loop.shape[0]):
@@ -394,7 +394,7 @@ def replay(recorded: Any, steps: Any, matrices: Any, line: Any, memory: Any, squ
         add_products(matrices.phase, rows[LEFT_LEARNT : LEFT_LEARNT + 1], wavefront)
         for c in range(wavefront.shape[1]):
             square += wavefront[0, c] * wavefront[0, c]
-        if not np.isfinite(_filter(matrices, memory, steps, math.inf, line[row])):
+        if not np.isfinite(_filter(matrices, memory, steps, largest, line[row])):
             return
         squares[frame] = square
         _advance(matrices, memory)
