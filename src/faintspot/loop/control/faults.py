@@ -247,6 +247,7 @@ def silent_subapertures(slopes: Floats, steps: Floats) -> Mask:
     """
     measured = np.isfinite(slopes)
     sent, seen = np.where(measured, steps, 0.0), np.where(measured, slopes, 0.0)
+    seen -= np.where(measured, seen.sum(axis=0) / np.maximum(measured.sum(axis=0), 1), 0.0)
     power, size, product = (
         (one * other).reshape(len(slopes), 2, -1).sum(axis=(0, 1))
         for one, other in ((sent, sent), (seen, seen), (sent, seen))
