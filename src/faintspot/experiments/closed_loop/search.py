@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import theilslopes
 
 from faintspot.base.checks import number_between
 from faintspot.base.text_files import parse_json, to_json
@@ -171,6 +170,8 @@ def smoothed(
         offered = [options[name].values for options in tuned]
         if declared[name].whole or not all(_is_scale(values) for values in offered):
             continue
+        from scipy.stats import theilslopes  # slow to import
+
         line = theilslopes(np.log([choice[name] for choice in choices]), flux, method="joint")
         for choice, log_flux, values in zip(results, flux, offered, strict=True):
             value = float(np.clip(math.exp(line.intercept + line.slope * log_flux), min(values), max(values)))

@@ -193,11 +193,11 @@ def one_magnitude(dataset: xarray.Dataset, mode: str, rng: np.random.Generator) 
 
 def never_worse(dataset: xarray.Dataset, mode: str, rng: np.random.Generator) -> Iterator[Case]:
     """Compare R in every cell."""
-    from scipy.stats import norm
+    from scipy.special import ndtri
 
     curves = study_curves(dataset, mode)
     total = sum(int(np.isfinite(curve.difference(TV, NO_TV)[0]).sum()) for curve in curves.values())
-    limit = float(norm.isf(_FAMILY_FALSE_ALARM / max(total, 1)))
+    limit = -float(ndtri(_FAMILY_FALSE_ALARM / max(total, 1)))
     for profile in measured_profiles(dataset):
         changes: list[tuple[float, float, str]] = []
         for key, curve in selected(curves, profile=profile, **dict.fromkeys(_FREE, "any")):

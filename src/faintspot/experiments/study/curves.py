@@ -213,7 +213,7 @@ class AgainstTV:
 
 def against_tv(dataset: xarray.Dataset, mode: str) -> list[AgainstTV]:
     """Return how each method compares with TV, by spot profile; nothing when TV is not in the study."""
-    from scipy.stats import norm
+    from scipy.special import ndtri
 
     curves = study_curves(dataset, mode)
     rows = []
@@ -232,7 +232,7 @@ def against_tv(dataset: xarray.Dataset, mode: str) -> list[AgainstTV]:
             n = int(finite.sum())
             if method == TV or n == 0:
                 continue
-            limit = float(norm.isf(_FAMILY_FALSE_ALARM / n))
+            limit = -float(ndtri(_FAMILY_FALSE_ALARM / n))
             ratio = error[finite, index] / error[finite, methods.index(TV)]
             rows.append(
                 AgainstTV(

@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import fftconvolve
 
 from faintspot.base.errors import InputError
 from faintspot.base.flags import INVALID, UNMEASURED, SubapertureFlag, are_valid
@@ -80,6 +79,8 @@ def _shifted(run: StoredRun, other: StoredRun, layout: Layout, theirs: Layout) -
 
     The lattices may be whole rows and columns apart: one result for each shift with the most common lenslets.
     """
+    from scipy.signal import fftconvolve  # slow to import
+
     own, cells = (each.cells - each.cells.min(axis=0) for each in (layout, theirs))
     lit, index = np.zeros(own.max(axis=0) + 1), np.full(cells.max(axis=0) + 1, -1)
     lit[tuple(own.T)], index[tuple(cells.T)] = 1.0, np.arange(len(cells))

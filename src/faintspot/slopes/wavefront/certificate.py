@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import t as student
+from scipy.special import stdtrit
 
 from faintspot.base.checks import number_between
 from faintspot.base.errors import InputError
@@ -312,5 +312,5 @@ def fit_drift(wavefront: Wavefront, bins: int, *, frame_rate_hz: float | None = 
     rate = since @ mean / (since @ since)
     residual = mean - mean.mean(axis=0) - np.outer(since, rate)
     rate_error = np.sqrt(np.sum(residual**2, axis=0) / (bins - 2) / (since @ since))
-    half_width = student.ppf(0.975, bins - 2) * rate_error
+    half_width = stdtrit(bins - 2, 0.975) * rate_error
     return Drift(time, mean, error, rate, rate_error, half_width, unit)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
-from scipy.stats import t as student
+from scipy.special import stdtrit
 
 from faintspot.base.checks import number_between
 from faintspot.base.errors import InputError
@@ -141,7 +141,7 @@ class Wavefront:
     @property
     def mean_half_width(self) -> Floats:
         """Half width of the 95 % interval of the mean, (k,), by Student's distribution."""
-        width: Floats = student.ppf(0.975, self.degrees_of_freedom) * self.mean_standard_error
+        width: Floats = stdtrit(self.degrees_of_freedom, 0.975) * self.mean_standard_error
         return width
 
     def is_lit(self, x: Floats, y: Floats) -> NDArray[np.bool_]:

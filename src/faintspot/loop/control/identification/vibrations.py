@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 from scipy.optimize import minimize
-from scipy.stats import chi2, gamma
+from scipy.special import chdtri, gammainccinv, gammaincinv
 
 from faintspot.loop.control.kalman.predictor import SlopeModel
 
@@ -193,7 +193,7 @@ class _Lines:
     def __init__(self, spectrum: Floats, spectra: ModeSpectra, rate_hz: float, slopes: int) -> None:
         self._spectrum, self._rate_hz, self._slopes = spectrum, rate_hz, slopes
         self._segments, self._bin_hz, window = spectra.segments, rate_hz / spectra.length, spectra.window
-        middle = gamma(self._segments, scale=1 / self._segments).median()
+        middle = float(gammaincinv(self._segments, 0.5)) / self._segments
         background = median_filter(spectrum, _BACKGROUND_BINS, mode="nearest") / middle
         self._background = np.maximum(background, 1e-12 * spectrum.max() + 1e-300)
         self._correlation = np.correlate(window, window, "full")[len(window) - 1 :]
@@ -207,7 +207,7 @@ class _Lines:
         ratio = self._spectrum / self._background
         first = max(3, math.ceil(_LOWEST_HZ / self._bin_hz))
         ratio[:first] = ratio[-3:] = 0.0
-        limit = gamma(self._segments, scale=1 / self._segments).isf(_FALSE_ALARM / len(ratio))
+        limit = float(gammainccinv(self._segments, _FALSE_ALARM / len(ratio))) / self._segments
         for _ in range(_MOST_TRIED):
             peak = int(np.argmax(ratio))
             if ratio[peak] <= limit:
@@ -250,7 +250,7 @@ class _Lines:
             start, options = np.append(best, np.zeros(order)), {"maxiter": 2000, "xatol": 1e-3, "fatol": 1e-3}
             fit = minimize(misfit_with, start, method="Nelder-Mead", options=options)
             best = fit.x
-        if without - fit.fun < chi2(3).isf(_FALSE_ALARM / len(self._spectrum)) / 2:
+        if without - fit.fun < chdtri(3, _FALSE_ALARM / len(self._spectrum)) / 2:
             return None
         errors, vibration = _errors(misfit_with, best), line(best)
         frequency, rms = errors[0] * self._bin_hz, 0.5 * errors[2] * vibration.rms_px
