@@ -58,8 +58,8 @@ def _telemetry(telemetry: Path, output: str | None, ao_mode: str) -> None:
     "cpus",
     multiple=True,
     metavar="NAME",
-    help="Processor to compile for: x86-64, x86-64-v3 (AVX2) or x86-64-v4 (AVX-512).",
-    show_default="all, chosen when the library starts",
+    help="Processor to compile for: x86-64, x86-64-v3 (AVX2), x86-64-v4 (AVX-512) or aarch64.",
+    show_default="all of x86-64, chosen when the library starts",
 )
 @option("--pixels", type=NAMES, metavar="LIST", default="uint16", help="Pixels: uint16, float32, images.")
 @REFERENCE
@@ -90,16 +90,15 @@ def _library(
 
     positions = None if reference is None else read_reference(reference)
     pipeline = SlopePipeline.from_file(config, reference=positions)
-    chosen = {"cpus": cpus} if cpus else {}
     with progress_bar("compile", "kernels") as progress:
         result = export_library(
             pipeline,
             output,
             Path(config).stem,
+            cpus=cpus,
             pixels=pixels,
             compiler=None if no_build else "cc",
             progress=progress,
-            **chosen,
         )
     click.echo(f"{result.bundle}: {result.bundle.stat().st_size / 1e3:.0f} kB for {', '.join(pixels)}")
     if result.library is None:

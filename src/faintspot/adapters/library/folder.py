@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from faintspot.adapters.library.bundle import PIXELS, Call, Variant, bundle_of, check_exportable
-from faintspot.adapters.library.objects import TARGETS, fingerprint, object_file
+from faintspot.adapters.library.objects import TARGETS, fingerprint, object_file, targets_of
 from faintspot.base.checks import one_of
 from faintspot.base.errors import InputError
 from faintspot.base.files import output_errors, write_atomically
@@ -40,7 +40,7 @@ def export_library(
     folder: str | Path,
     name: str = "sensor",
     *,
-    cpus: Sequence[str] = tuple(TARGETS),
+    cpus: Sequence[str] = (),
     pixels: Sequence[str] = ("uint16",),
     compiler: str | None = "cc",
     progress: Callable[[int, int], None] = lambda done, total: None,
@@ -57,7 +57,8 @@ def export_library(
     name : str
         Name of the bundle.
     cpus : sequence of str
-        Kinds of processors, of `objects.TARGETS`; the library chooses the fastest that it runs on.
+        Kinds of processors, of `objects.TARGETS`; the library chooses the fastest that it runs on. Default:
+        all like this one.
     pixels : sequence of str
         Kinds of pixels, of `bundle.PIXELS`.
     compiler : str, optional
@@ -70,11 +71,10 @@ def export_library(
     InputError
         When the settings are not covered, the folder cannot be written, or a compiler fails.
     """
-    if platform.system() != "Linux" or platform.machine() != "x86_64":
-        raise InputError(f"library: expected Linux on x86-64, got {platform.system()} {platform.machine()}")
     check_exportable(pipeline)
-    chosen = [one_of("cpu", cpu, tuple(TARGETS)) for cpu in cpus]
+    chosen = [one_of("cpu", cpu, tuple(TARGETS)) for cpu in cpus] or targets_of(platform.machine())
     wanted = [cpu for cpu in TARGETS if cpu in chosen]
+    machine = _only_machine(Path(folder) / "kernels", wanted)
     kinds = [one_of("pixels", kind, PIXELS) for kind in dict.fromkeys(pixels)]
     folder = Path(folder)
     with output_errors(folder):
@@ -100,7 +100,18 @@ def export_library(
     rows = (f"KERNEL({path.stem.partition('-')[0]}, {path.stem.partition('-')[2]})" for path in objects)
     write_atomically(folder / "kernels" / "list.h", "\n".join([*rows, ""]))
     build_line = f"cd {folder} && cc {BUILD}"
-    return ExportedLibrary(bundle, _built(folder, compiler), build_line, compiled)
+    library = _built(folder, compiler if machine == platform.machine() else None)
+    return ExportedLibrary(bundle, library, build_line, compiled)
+
+
+def _only_machine(folder: Path, cpus: Sequence[str]) -> str:
+    """Return the kind of the processors; refuse several kinds in one folder of kernels."""
+    levels = {int(path.stem.rpartition("-")[2]) for path in folder.glob("*.o")}
+    machines = {target.machine for target in TARGETS.values() if target.level in levels}
+    machines |= {TARGETS[cpu].machine for cpu in cpus}
+    if len(machines) > 1:
+        raise InputError(f"cpu: {' and '.join(sorted(machines))} in {folder}: choose another folder for each")
+    return machines.pop()
 
 
 def _key(call: Call, cpu: str) -> str:

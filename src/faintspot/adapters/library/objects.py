@@ -10,6 +10,7 @@ from __future__ import annotations
 import hashlib
 import os
 import pickle
+import platform
 import subprocess
 import sys
 from importlib import import_module
@@ -33,11 +34,16 @@ class CpuTarget(NamedTuple):
     """Kind of processors that objects are compiled for."""
 
     level: int
-    """As in faintspot.c, which asks the processor for what the level needs."""
+    """As in faintspot.c, which asks the processor for what the level needs; 0: not x86-64."""
     width: int
     """Number of float32 lanes."""
     features: str
     """LLVM's features."""
+
+    @property
+    def machine(self) -> str:
+        """Kind of processors, as `platform.machine` names it."""
+        return "x86_64" if self.level else "aarch64"
 
     @property
     def needed(self) -> frozenset[str]:
@@ -49,14 +55,31 @@ TARGETS = {
     "x86-64-v4": CpuTarget(4, 16, f"{_AVX2},+avx512f,+avx512bw,+avx512cd,+avx512dq,+avx512vl"),
     "x86-64-v3": CpuTarget(3, 8, _AVX2),
     "x86-64": CpuTarget(1, 4, _SSE),
+    "aarch64": CpuTarget(0, 4, "+neon,+fp-armv8"),
 }
 """Targets by LLVM's name, the fastest first."""
 
 
 def native_target() -> str:
     """Return the target whose code has the bits of Python's on this processor."""
-    features, names = compile_target().features, iter(TARGETS)
-    return next((name for name in names if TARGETS[name].needed <= features), "x86-64")
+    features, own = compile_target().features, targets_of(platform.machine())
+    return next((name for name in own if TARGETS[name].needed <= features), own[-1])
+
+
+def targets_of(machine: str) -> tuple[str, ...]:
+    """Return the names of the targets of a kind of processors, the fastest first.
+
+    Raises
+    ------
+    InputError
+        When there is none.
+    """
+    found = tuple(name for name, target in TARGETS.items() if target.machine == machine)
+    if not found or platform.system() != "Linux":
+        raise InputError(
+            f"library: expected Linux on x86-64 or aarch64, got {platform.system()} on {machine}"
+        )
+    return found
 
 
 def argument_types(arguments: tuple[Any, ...]) -> tuple[Any, ...]:
@@ -83,13 +106,15 @@ def object_file(kernel: Any, kinds: tuple[Any, ...], cpu: str, name: str) -> byt
     """
     environment = {
         **os.environ,
-        "NUMBA_CPU_NAME": cpu,
+        "NUMBA_CPU_NAME": cpu if TARGETS[cpu].machine == "x86_64" else "generic",
         "NUMBA_CPU_FEATURES": TARGETS[cpu].features,
         "FAINTSPOT_SIMD_WIDTH": str(TARGETS[cpu].width),
         "PYTHONPATH": os.pathsep.join(filter(None, sys.path)),
     }
+    program = _FOR_ANOTHER_MACHINE if TARGETS[cpu].machine != platform.machine() else ""
+    program = program.format(triple=f"{TARGETS[cpu].machine}-unknown-linux-gnu")
     done = subprocess.run(
-        [sys.executable, "-P", "-c", f"from {__name__} import main; main()"],
+        [sys.executable, "-P", "-c", f"{program}from {__name__} import main; main()"],
         input=pickle.dumps((*_reference(kernel), kinds, name)),
         capture_output=True,
         env=environment,
@@ -99,6 +124,14 @@ def object_file(kernel: Any, kinds: tuple[Any, ...], cpu: str, name: str) -> byt
         reason = done.stderr.decode(errors="replace").strip().splitlines() or ["no message"]
         raise InputError(f"kernel for {cpu}: cannot be compiled ({reason[-1]})")
     return done.stdout
+
+
+_FOR_ANOTHER_MACHINE = """
+import llvmlite.binding as llvm
+llvm.initialize_all_targets()
+llvm.initialize_all_asmprinters()
+llvm.get_process_triple = llvm.get_default_triple = lambda: "{triple}"  # before Numba asks
+"""
 
 
 def _reference(kernel: Any) -> tuple[bool, str, str]:

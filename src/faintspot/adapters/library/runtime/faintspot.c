@@ -70,12 +70,16 @@ static uint32_t checksum(const unsigned char *data, size_t size) { /* CRC-32 of 
     return ~crc;
 }
 
-/* Level of x86-64 of this processor: 4 with AVX-512, 3 with AVX2 and FMA. */
+/* Level of x86-64 of this processor: 4 with AVX-512, 3 with AVX2 and FMA; 0: another one. */
 static int processor_level(void) {
+#if !defined(__x86_64__)
+    return 0;
+#else
     __builtin_cpu_init();
 #define HAS(feature) (__builtin_cpu_supports(feature) != 0)
     if (!(HAS("avx2") && HAS("fma") && HAS("bmi") && HAS("bmi2") && HAS("popcnt"))) return 1;
     return HAS("avx512f") && HAS("avx512bw") && HAS("avx512cd") && HAS("avx512dq") && HAS("avx512vl") ? 4 : 3;
+#endif
 }
 
 static kernel kernel_of(uint64_t key, int level, int *needs) {
@@ -191,7 +195,7 @@ static const char *choose(faintspot *s, const char *bundle, size_t size, int pix
         if (!s->measure || !s->check) continue;
         const variant *v = &s->v;
         const header *kept = (const header *)s->bundle;
-        s->sensor = (faintspot_sensor){v->n, v->ny, v->nx, v->h, v->w, v->width, v->groups, pixels, needs == 4 ? "x86-64-v4" : needs == 3 ? "x86-64-v3" : "x86-64", kept->version, kept->fingerprint};
+        s->sensor = (faintspot_sensor){v->n, v->ny, v->nx, v->h, v->w, v->width, v->groups, pixels, needs == 4 ? "x86-64-v4" : needs == 3 ? "x86-64-v3" : needs ? "x86-64" : "aarch64", kept->version, kept->fingerprint};
         return fill(s, &h, e.offset, threads);
     }
     return there ? "this library has no kernels for the bundle on this processor: export it into the library's folder" : "the bundle has no tables for these pixels: see --pixels of faintspot export library";
