@@ -37,6 +37,7 @@ _ORDER = (
     "realtime_sustained",
     "pyrtc",
     "pyrtc_loop",
+    "darc",
     "loop",
     "control",
     "prediction",
@@ -53,6 +54,7 @@ _ORDER = (
 )
 NAMES = tuple(name for name in _ORDER if importlib.util.find_spec(f"benchmarks.{name}"))
 LONG = {
+    "darc",
     "guard",
     "following",
     "realtime_sustained",
