@@ -184,6 +184,31 @@ def _rows(sensor: Sensor, folder: Path, threads: int, flags: str) -> list[Row]:
     return rows
 
 
+def early_stop(sensor: Sensor, folder: Path) -> Table:
+    """Compare DARC's TV with its early stop (`tvmPrecision`) and without, at most 200 iterations."""
+    f, n, truth = np.float32, len(sensor.layout), sensor.truth_px.reshape(len(sensor.frames), -1)
+    base = parameters(sensor.layout, folder, DARK_ADU) | {"useBrightest": np.int32(-KEPT)}
+    base |= {"totVarMin": np.full(n, STRENGTH_E, f), "tvmMaxIter": np.full(n, 200, np.int32)}
+    slow = {"CAMERA_FRAMES": str(sensor.file), "RING": str(folder / "ring"), "CAMERA_PERIOD_US": "40000"}
+    recorded = {}
+    with Darc(folder, "faintspot_b_", base, slow) as darc:
+        for precision in (0.0, 0.001, 0.01, 0.1):
+            darc.switch(base | {"tvmPrecision": np.full(n, precision, f)})
+            darc.next(2)
+            recorded[precision] = darc.next(len(truth))
+    rows, slopes_of = [], {}
+    for precision, (numbers, slopes) in recorded.items():
+        which = aligned(numbers, slopes, sensor)
+        slopes_of[precision] = slopes[np.argsort(which)]
+        difference = slopes_of[precision] - slopes_of[0.0]
+        values = {
+            "error, px": float((slopes - truth[which]).std()),
+            "rms difference, px": float(difference.std()),
+        }
+        rows.append(Row(f"tvmPrecision {precision:g}", values))
+    return Table("early_stop", "Early stop of DARC's TV, 36 sub-apertures", rows)
+
+
 def run() -> list[Table]:
     """Measure both sensors with one and two threads, and DARC's own modules also with its fastest flags."""
     if lacking := missing():
@@ -202,4 +227,5 @@ def run() -> list[Table]:
                 n, (ny, nx) = len(sensor.layout), sensor.layout.window
                 title = f"{n} sub-apertures of {ny} x {nx} pixels, {threads} thread{'s' * (threads > 1)}"
                 tables.append(Table(f"modules_{n}_{threads}", title, rows))
+        tables.append(early_stop(sensors[0], builds[""]))
     return tables
