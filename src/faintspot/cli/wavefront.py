@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _WIDEST_HEADING = 12  # of numbers, characters
+_SHOWN = 10  # modes, up to the spherical aberration, so that the certificate is on the same screen
 
 
 @click.command(cls=SectionedCommand)
@@ -126,7 +127,10 @@ def command(
         over_time = None
         if drift is not None:
             over_time = fit_drift(wavefront, drift, frame_rate_hz=options["frame_rate_hz"])
-    tables = [mode_table(wavefront), certificate_table(found, wavefront.unit)]
+    tables = [
+        mode_table(wavefront, _SHOWN if modes is None else None),
+        certificate_table(found, wavefront.unit),
+    ]
     _print([*tables, drift_table(over_time, wavefront)] if over_time else tables, wavefront, notes)
     if output is not None:
         save_wavefront(output, wavefront, found, over_time)

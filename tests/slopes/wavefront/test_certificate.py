@@ -43,11 +43,11 @@ def test_sizes_of_a_wavefront_without_noise() -> None:
 
 
 def test_error_of_the_radius_of_curvature_is_its_scatter() -> None:
-    """Over 200 measurements, whose scatter is known to 5 %; three standard errors of that."""
-    defocus = np.array([noisy(SCALED, TRUE, 0.05, seed).mean[2] for seed in range(200)])
+    """Over 60 measurements, whose scatter is known to 9 %; three standard errors of that."""
+    defocus = np.array([noisy(SCALED, TRUE, 0.05, seed).mean[2] for seed in range(60)])
     radii = 2.1**2 / (4 * np.sqrt(3) * 1e-9 * defocus)
     stated = certify(noisy(SCALED, TRUE, 0.05, 0), draws=100).radius_of_curvature_m.standard_error
-    assert stated == pytest.approx(radii.std(), rel=0.15)
+    assert stated == pytest.approx(radii.std(), rel=0.27)
 
 
 def test_sizes_are_those_of_the_lit_part() -> None:

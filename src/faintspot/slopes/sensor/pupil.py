@@ -5,14 +5,20 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import minimize
+from scipy.spatial import cKDTree
 
 from faintspot.base.errors import InputError
-from faintspot.base.flags import SubapertureFlag
+from faintspot.base.flags import UNMEASURED, SubapertureFlag
 from faintspot.slopes.sensor.layout import Layout
 
 Floats = NDArray[np.float64]
 
 _DISK_CORNERS = 256
+_WHOLE = 1.0  # misfit, in lenslets, that a disk around whole lenslets may have more than the best one
+# Part of the lenslets at the edge that are lit in part, by 0.2 to 0.8, if it cuts them: at random, 0.4 are.
+_PARTLY, _CUT = 0.3, 0.15
+_FULL = 0.7  # quantile of the flux of illuminated sub-apertures that is that of a whole one
 _MOST_UNLIT = 2.5  # sub-apertures of a stated diameter, cut by its edge on both sides
 
 
@@ -28,46 +34,54 @@ class Pupil:
     """Radius in sub-aperture sides."""
     radius_m: float | None
     """Radius in the entrance pupil; None if the layout does not give its size."""
-    stated: bool = False
-    """Whether the layout states the disk's size in sub-apertures: it is known where it cuts them."""
+    error_subapertures: float
+    """Standard error of the radius, from how well the disk describes the flux of the sub-apertures."""
+    cuts: bool = False
+    """Whether it is known where its edge cuts sub-apertures: from two lengths of the layout, or the flux."""
     part: bool = False
-    """Whether the layout has sub-apertures without flux, which the disk does not count."""
+    """Whether the layout has sub-apertures without flux, or with flux outside, which the disk does not count.
+    """
 
 
-def pupil_of(layout: Layout, flags: NDArray[Any] | None = None) -> Pupil:
+def pupil_of(layout: Layout, flags: NDArray[Any] | None = None, flux: NDArray[Any] | None = None) -> Pupil:
     """Return the disk of the pupil.
 
-    The centre is that of the rectangle along the rows of the lattice that contains all illuminated
-    sub-apertures. The diameter is its longer side, so that corners of a square array are outside; if both
-    `subaperture_m` and `diameter_m` are given, it is their ratio.
+    Centre and radius minimise the absolute differences between the flux of the sub-apertures and their area
+    in the disk, so that single ones outside do not count. If the rectangle along the rows of the lattice that
+    contains all illuminated sub-apertures in that disk describes the flux as well, its centre and longer side
+    are those of the disk, also for square arrays, whose corners are outside. If both `subaperture_m` and
+    `diameter_m` are given, the diameter is their ratio.
 
     Parameters
     ----------
     layout : Layout
-    flags : (n,) or (n_frames, n) array of int, optional
-        Flags of slopes. Default: all sub-apertures of the layout are illuminated.
+    flags, flux : (n,) or (n_frames, n) array, optional
+        Flags and flux of slopes. Default: all sub-apertures of the layout have the same flux.
 
     Raises
     ------
     InputError
-        If these two give a disk outside which a sub-aperture lies as a whole, or one that the illuminated
-        sub-apertures do not fill.
+        If these two give a disk outside which an illuminated part of the pupil lies, or one that this does
+        not fill.
     """
     lit = np.ones(len(layout), np.bool_) if flags is None else lit_subapertures(flags)
+    light = lit.astype(np.float64)
+    if flags is not None and flux is not None:
+        seen = lit * np.where(flags & int(UNMEASURED), 0.0, flux).reshape(-1, len(layout)).mean(axis=0)
+        full = float(np.quantile(seen[lit], _FULL))
+        light = np.clip(seen / full, 0.0, 1.0) if full > 0 else light
     pitch = lenslet_pitch(layout)
     angle = np.deg2rad(layout.angle_deg)
     along = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
-    centres = layout.centres[lit]
-    rotated = centres @ along  # x along the rows
-    low, high = rotated.min(axis=0), rotated.max(axis=0)
-    x, y = along @ ((low + high) / 2)
-    farthest = float(np.hypot(*(centres - (x, y)).T).max())
-    radius = 0.5 * (float((high - low).max()) + pitch)
+    rotated = layout.centres @ along / pitch  # x along the rows
+    disk, error, inside, cuts = _disk_of(rotated, light, 6 if layout.geometry == "hexagonal" else 4)
+    x, y = along @ disk[:2] * pitch
+    farthest = float(np.hypot(*(layout.centres[inside] - (x, y)).T).max())
+    radius = disk[2] * pitch
     side, diameter = layout.subaperture_m, layout.diameter_m
-    stated = side is not None and diameter is not None
     if side is not None and diameter is not None:
         across = 2 * radius / pitch
-        radius = 0.5 * pitch * diameter / side
+        radius, error, cuts = 0.5 * pitch * diameter / side, 0.0, True
         unlit = diameter / side - across > max(_MOST_UNLIT, 0.1 * across)
         if unlit or farthest > radius + pitch / np.sqrt(2):
             extent = f"{across:.3g}" if unlit else f"{2 * farthest / pitch:.3g} between the farthest centres"
@@ -79,7 +93,57 @@ def pupil_of(layout: Layout, flags: NDArray[Any] | None = None) -> Pupil:
     elif side is not None:
         diameter = 2 * radius / pitch * side
     metres = None if diameter is None else diameter / 2
-    return Pupil((float(x), float(y)), radius, radius / pitch, metres, stated, not lit.all())
+    return Pupil((float(x), float(y)), radius, radius / pitch, metres, error, cuts, not inside.all())
+
+
+def _disk_of(at: Floats, light: Floats, sides: int) -> tuple[Floats, float, NDArray[np.bool_], bool]:
+    """Return centre and radius of the disk, the radius' error, lenslets inside, and whether it cuts them.
+
+    Lengths are in pitches: of lenslets at (n, 2), with relative flux `light` (n,), and 4 or 6 neighbours.
+    """
+    turns = 2 * np.pi * np.arange(sides) / sides
+    beside = (at[:, None] + np.stack([np.cos(turns), np.sin(turns)], axis=-1)).reshape(-1, 2)
+    beside = beside[cKDTree(at).query(beside)[0] > 0.5]  # not in the layout: they have no more than half
+
+    def share(disk: Floats, of: Floats) -> Floats:
+        away = np.abs(of - disk[:2]) + 1e-9
+        distance = np.hypot(*away.T)
+        return np.clip(0.5 + (disk[2] - distance) * distance / away.sum(axis=1), 0.0, 1.0)
+
+    def misfit(disk: Floats) -> float:
+        missing = np.maximum(share(disk, beside) - 0.5, 0.0)
+        return float(np.abs(light - share(disk, at)).sum() + missing.sum())
+
+    lit = light > 0
+    middle = np.median(at[lit], axis=0)
+    most = float(np.quantile(np.hypot(*(at[lit] - middle).T), 0.9)) + 0.5
+    steps = np.concatenate([np.zeros((1, 3)), 0.5 * np.diag([1.0, 1.0, -1.0])])
+    options = {"xatol": 0.01, "fatol": 0.01}
+    fits = [
+        minimize(misfit, start, method="Nelder-Mead", options={**options, "initial_simplex": start + steps})
+        for start in (_around(at[lit]), np.append(middle, most))
+    ]
+    disk = min(fits, key=lambda fit: float(fit.fun)).x
+    around = _around(at[lit])
+    low, high = at[lit].min(axis=0) - 0.5, at[lit].max(axis=0) + 0.5
+    lacking = ((beside > low) & (beside < high)).all(axis=1)
+    if float((1 - light).sum()) + 0.5 * np.count_nonzero(lacking) < misfit(disk):
+        return around, 0.0, lit, False  # a square array
+    inside = lit & (np.hypot(*(at - disk[:2]).T) < disk[2] + 0.5)
+    around = _around(at[inside])
+    edge = np.abs(np.hypot(*(at - disk[:2]).T) - disk[2]) < 1
+    partly = np.abs(light[edge] - 0.5) < _PARTLY
+    cuts = misfit(around) > misfit(disk) + _WHOLE and np.count_nonzero(partly) > _CUT * len(partly)
+    disk = disk if cuts else around
+    difference = light[edge] - share(disk, at[edge])
+    # Differences of neighbours are alike: of four, about one is independent.
+    return disk, 2 * float(np.linalg.norm(difference)) / max(len(difference), 1), inside, cuts
+
+
+def _around(at: Floats) -> Floats:
+    """Return centre and half the longer side of the rectangle around lenslets at (n, 2), in pitches."""
+    low, high = at.min(axis=0), at.max(axis=0)
+    return np.append((low + high) / 2, 0.5 * (float((high - low).max()) + 1.0))
 
 
 def lit_subapertures(flags: NDArray[Any]) -> NDArray[np.bool_]:

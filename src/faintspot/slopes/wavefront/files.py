@@ -36,8 +36,11 @@ def mode_records(wavefront: Wavefront) -> list[dict[str, Any]]:
     ]
 
 
-def mode_table(wavefront: Wavefront) -> tuple[list[str], list[list[str]]]:
-    """Return header and rows: each mode of the mean wavefront with its standard error, and its rms."""
+def mode_table(wavefront: Wavefront, most: int | None = None) -> tuple[list[str], list[list[str]]]:
+    """Return header and rows: each mode of the mean wavefront with its standard error, and its rms.
+
+    One row stands for all modes after the first `most`.
+    """
     several, unit = np.count_nonzero(wavefront.fitted) > 1, wavefront.unit
     header = ["Noll", "name", "OSA", f"{'mean' if several else 'value'} ({unit})", "± standard error"]
     digits = _decimals(wavefront.rms_of_frames)
@@ -48,6 +51,11 @@ def mode_table(wavefront: Wavefront) -> tuple[list[str], list[list[str]]]:
         numbers = signed(mode["mean"], digits), number_or_dash(mode["standard_error"], digits)
         row = [f"Z{mode['noll']}", mode["name"], str(mode["osa"]), *numbers]
         rows.append([*row, f"{of_frames:.{digits}f}"] if several else row)
+    if most is not None and len(rows) > most + 1:
+        last, rest = wavefront.modes[-1], [NOTHING, f"{total(wavefront.mean[most:]):.{digits}f}", NOTHING]
+        name = f"to Z{last}, root sum of squares (--modes {len(rows)}: each)"
+        row = [rows[most][0], name, *rest, f"{total(wavefront.rms_of_frames[most:]):.{digits}f}"]
+        rows[most:] = [row if several else row[:-1]]
     return [*header, f"rms of frames ({unit})"] if several else header, rows
 
 
@@ -96,6 +104,7 @@ def remarks(wavefront: Wavefront) -> list[str]:
         first=wavefront.modes[0],
         last=wavefront.modes[-1],
         diameter=2 * pupil.radius_subapertures,
+        error=f" ± {2 * pupil.error_subapertures:.1g}" if pupil.error_subapertures else "",
         x=pupil.centre_px[0],
         y=pupil.centre_px[1],
         radius=pupil.radius_px,
@@ -166,6 +175,7 @@ def _values(wavefront: Wavefront, found: Certificate) -> dict[str, Any]:
         "unit": wavefront.unit,
         "pupil_radius_m": wavefront.pupil.radius_m,
         "pupil_radius_subapertures": wavefront.pupil.radius_subapertures,
+        "pupil_radius_error_subapertures": wavefront.pupil.error_subapertures,
         "pupil_centre_px": wavefront.pupil.centre_px,
         "pupil_radius_px": wavefront.pupil.radius_px,
         "standard_errors_from": wavefront.errors_from,

@@ -11,7 +11,7 @@ from scipy.special import stdtrit
 
 from faintspot.base.checks import number_between
 from faintspot.base.errors import InputError
-from faintspot.base.flags import leave_out
+from faintspot.base.flags import SubapertureFlag, leave_out
 from faintspot.slopes.pipeline.slopes import Slopes
 from faintspot.slopes.sensor.layout import Layout
 from faintspot.slopes.sensor.pupil import Pupil, inside_pupil, lenslet_outlines, lit_outlines, pupil_of
@@ -27,6 +27,7 @@ LARGEST_CONDITION = 100.0
 """Largest condition number of the modes' gradients, each scaled to 1: the noise amplification allowed."""
 _HIGHEST_ORDER, _USUAL_CONDITION = 8, 20.0  # defaults; higher orders are rarely needed
 _TILTS = 2
+_SURELY = 3.0  # standard errors of the squares of the residuals
 _FEWEST_SUBAPERTURES = 3  # two show no surface
 _ROUNDING = 1e-9  # of lengths in radii
 _LEAST_SHARE = 0.1  # of a sub-aperture's area in the pupil, below which its slope tells too little
@@ -54,6 +55,8 @@ class Wavefront:
     noise_covariance: Floats
     """Covariance of one frame's coefficients from the slopes' noise, (k, k), mean over the frames; NaN if
     unknown."""
+    misfit_covariance: Floats
+    """Covariance of the mean coefficients from what the fitted modes leave beyond the noise, (k, k)."""
     freedom: float
     """Degrees of freedom of one frame's standard errors; infinite for those of the slopes."""
     outlines: Floats
@@ -84,19 +87,19 @@ class Wavefront:
 
     @property
     def mean_standard_error(self) -> Floats:
-        """Standard error of the mean, (k,), from the scatter over frames; for one frame, its own."""
+        """Standard error of the mean, (k,), from the scatter over frames (of one: its noise), and misfit."""
         error: Floats = np.sqrt(np.diag(self.mean_covariance))
         return error
 
     @property
     def mean_covariance(self) -> Floats:
-        """Covariance of the mean's errors, (k, k), including those of the reference.
+        """Covariance of the mean's errors, (k, k), including those of the reference, and of the misfit.
 
         For several frames, variances are those of their scatter. Correlations are those of the scatter and,
         with the weight of k frames, those of the slopes' noise: few frames do not determine them.
         """
-        own = self._own_covariance
-        return own if self.subtracted is None else own + self.subtracted.mean_covariance
+        own = self._own_covariance + self.misfit_covariance
+        return own if self.subtracted is None else own + self.subtracted._own_covariance
 
     @property
     def _own_covariance(self) -> Floats:
@@ -114,29 +117,30 @@ class Wavefront:
 
     @property
     def degrees_of_freedom(self) -> Floats:
-        """Degrees of freedom of `mean_standard_error`, (k,); with a reference by Welch (1947).
+        """Degrees of freedom of `mean_standard_error`, (k,), by Welch (1947).
 
         The variances that weigh both parts are at least those of the slopes' noise: where a scatter of few
         frames is small by chance, it would count as better known than it is.
         """
-        frames = int(np.count_nonzero(self.fitted))
-        own = np.full(len(self.modes), frames - 1.0 if frames > 1 else self.freedom)
-        if self.subtracted is None:
-            return own
-        parts = self._own_variances, self.subtracted.variances
-        squares = parts[0] ** 2 / own + parts[1] ** 2 / self.subtracted.degrees_of_freedom
-        both = (parts[0] + parts[1]) ** 2
-        return np.asarray(np.divide(both, squares, out=np.full(len(own), np.inf), where=squares > 0))
+        squares = np.sum([part**2 / freedom for part, freedom in self._parts], axis=0)
+        both = self.variances**2
+        return np.asarray(np.divide(both, squares, out=np.full(len(both), np.inf), where=squares > 0))
 
     @property
     def variances(self) -> Floats:
         """Variances of the mean, (k,), for degrees of freedom: not below those of the slopes' noise."""
-        return self._own_variances + (0.0 if self.subtracted is None else self.subtracted.variances)
+        return np.asarray(np.sum([part for part, _ in self._parts], axis=0))
 
     @property
-    def _own_variances(self) -> Floats:
-        noise = np.diag(self.noise_covariance) / np.count_nonzero(self.fitted)
-        return np.asarray(np.fmax(np.diag(self._own_covariance), noise))
+    def _parts(self) -> list[tuple[Floats, float]]:
+        """Independent parts of `variances` with their degrees of freedom."""
+        parts = [(np.diag(self.misfit_covariance), max(2.0 * len(self.outlines) - len(self.modes), 1.0))]
+        for one in (self, *([] if self.subtracted is None else [self.subtracted])):
+            frames = int(np.count_nonzero(one.fitted))
+            noise = np.diag(one.noise_covariance) / frames
+            own = np.fmax(np.diag(one._own_covariance), noise)
+            parts.append((np.asarray(own), frames - 1.0 if frames > 1 else one.freedom))
+        return parts
 
     @property
     def mean_half_width(self) -> Floats:
@@ -215,8 +219,8 @@ def fit_wavefront(slopes: Slopes, layout: Layout, *, modes: int | None = None) -
         With `pixel_scale_arcsec`, and `subaperture_m` or `diameter_m`, the wavefront is in nm.
     modes : int, optional
         Number of modes, from tip and tilt on. Default: all up to the highest radial order (at most 8) with no
-        more than three modes for four sub-apertures and a good condition number. Orders that are not fitted
-        leak into the two highest fitted ones.
+        more than three modes for four sub-apertures whose estimates converged, and a good condition number.
+        Orders that are not fitted leak into the two highest fitted ones.
 
     Raises
     ------
@@ -241,13 +245,14 @@ def fit_wavefront(slopes: Slopes, layout: Layout, *, modes: int | None = None) -
     x, y, flags = (np.atleast_2d(getattr(slopes, name)) for name in ("x", "y", "flags"))
     if x.ndim != 2 or x.shape[1] != len(layout):
         raise InputError(f"slopes: expected {len(layout)} sub-apertures, as in the layout, got {x.shape[-1]}")
-    pupil = pupil_of(layout, flags)
+    pupil = pupil_of(layout, flags, slopes.flux)
     outlines, share = _in_pupil(layout, pupil)
     valid, left_out = leave_out(flags, slopes.keep, {"outside the pupil": share < _LEAST_SHARE})
     illuminated = np.asarray(valid.any(axis=0))
     if np.count_nonzero(illuminated) < _FEWEST_SUBAPERTURES:
         raise _too_few(illuminated, left_out)
-    gradients, condition = _chosen_gradients(modes, outlines, illuminated)
+    settled = (valid & (flags & int(SubapertureFlag.NOT_CONVERGED) == 0)).any(axis=0)
+    gradients, condition = _chosen_gradients(modes, outlines, illuminated, int(np.count_nonzero(settled)))
     unit, scale = _unit_of(layout, pupil)
     errors = np.concatenate(
         [np.atleast_2d(getattr(slopes, f"standard_error_{axis}")) for axis in "xy"], axis=1
@@ -256,7 +261,7 @@ def fit_wavefront(slopes: Slopes, layout: Layout, *, modes: int | None = None) -
     has_errors = bool(np.isfinite(errors[used]).all())
     noise = np.square(errors, dtype=np.float64), np.atleast_2d(slopes.covariance_xy).astype(np.float64)
     measured = np.concatenate([x, y], axis=1).astype(np.float64)
-    coefficients, standard_errors, residual, covariance = _fit(
+    coefficients, standard_errors, residual, covariance, misfit = _fit(
         measured, used, gradients, share, noise if has_errors else None
     )
     return Wavefront(
@@ -266,6 +271,7 @@ def fit_wavefront(slopes: Slopes, layout: Layout, *, modes: int | None = None) -
         residual_px=residual,
         condition=condition,
         noise_covariance=scale**2 * covariance,
+        misfit_covariance=scale**2 * misfit,
         freedom=np.inf if has_errors else 2.0 * np.count_nonzero(illuminated) - gradients.shape[1],
         outlines=(lenslet_outlines(layout)[illuminated] - pupil.centre_px) / pupil.radius_px,
         unit=unit,
@@ -291,7 +297,7 @@ def _too_few(valid: NDArray[np.bool_], left_out: str) -> InputError:
 
 def _in_pupil(layout: Layout, pupil: Pupil) -> tuple[Floats, Floats]:
     """Return the outlines of the sub-apertures, in radii from the pupil's centre, and their shares in it."""
-    if pupil.stated:
+    if pupil.cuts:
         outlines, share = lit_outlines(layout, pupil)
     else:
         outlines, share = lenslet_outlines(layout), inside_pupil(layout, pupil).astype(np.float64)
@@ -299,13 +305,13 @@ def _in_pupil(layout: Layout, pupil: Pupil) -> tuple[Floats, Floats]:
 
 
 def _chosen_gradients(
-    modes: int | None, outlines: Floats, illuminated: NDArray[np.bool_]
+    modes: int | None, outlines: Floats, illuminated: NDArray[np.bool_], settled: int
 ) -> tuple[Floats, float]:
     """Return the mean gradients (2 n, k) of the modes to fit (all x, then all y) and their condition."""
     n = int(np.count_nonzero(illuminated))
     if modes is None:
         counts = [order * (order + 3) // 2 for order in range(_HIGHEST_ORDER, 0, -1)]
-        counts, limit = [count for count in counts if count <= 0.75 * n] or [_TILTS], _USUAL_CONDITION
+        counts, limit = [count for count in counts if count <= 0.75 * settled] or [_TILTS], _USUAL_CONDITION
     else:
         counts = [int(number_between("modes", modes, _TILTS, 2 * n, integer=True))]
         limit = LARGEST_CONDITION
@@ -336,8 +342,8 @@ def _fit(
     gradients: Floats,
     share: Floats,
     noise: tuple[Floats, Floats] | None,
-) -> tuple[Floats, Floats, Floats, Floats]:
-    """Return coefficients, standard errors, residuals' rms and mean covariance for a radius and px of 1.
+) -> tuple[Floats, Floats, Floats, Floats, Floats]:
+    """Return coefficients, standard errors, residuals' rms, covariances (noise, misfit) for a radius of 1 px.
 
     Frames with the same valid sub-apertures share one inverse. `noise` are the slopes' variances, all x, then
     all y, and the covariances of x and y; without it, it is estimated from the residuals.
@@ -360,11 +366,12 @@ def _weighted_fit(
     gradients: Floats,
     weights: Floats,
     noise: tuple[Floats, Floats] | None,
-) -> tuple[Floats, Floats, Floats, Floats]:
+) -> tuple[Floats, Floats, Floats, Floats, Floats]:
     """Return what `_fit` does for the given weights of the slopes, (2 n,)."""
     frames, k = len(slopes), gradients.shape[1]
     coefficients, standard_errors = np.full((frames, k), np.nan), np.full((frames, k), np.nan)
-    residual, total_covariance = np.full(frames, np.nan), np.zeros((k, k))
+    residual, total_covariance, of_misfit = np.full(frames, np.nan), np.zeros((k, k)), np.zeros((k, k))
+    left = np.full(slopes.shape, np.nan)
     patterns, of_frame = np.unique(np.packbits(valid, axis=1), axis=0, return_inverse=True)
     for number in range(len(patterns)):
         rows = np.flatnonzero(of_frame.ravel() == number)
@@ -377,7 +384,8 @@ def _weighted_fit(
         measured = slopes[np.ix_(rows, used)]
         fitted = measured @ inverse.T
         residuals = measured - fitted @ gradients[used].T
-        coefficients[rows] = fitted
+        coefficients[rows], left[np.ix_(rows, used)] = fitted, residuals
+        of_misfit += len(rows) * inverse @ inverse.T
         residual[rows] = np.sqrt(np.mean(residuals**2, axis=1))
         freedom = measured.shape[1] - k
         if noise is not None:
@@ -397,4 +405,28 @@ def _weighted_fit(
             continue
         standard_errors[rows] = np.sqrt(variance)
     count = max(int(np.isfinite(residual).sum()), 1)
-    return coefficients, standard_errors, residual, total_covariance / count
+    misfit = _unexplained(left, k, None if noise is None else noise[0]) * of_misfit / count
+    return coefficients, standard_errors, residual, total_covariance / count, misfit
+
+
+def _unexplained(residuals: Floats, k: int, variances: Floats | None) -> float:
+    """Return the variance of mean slopes about k fitted modes that their noise does not explain, px^2.
+
+    Residuals are (n_frames, 2 n), NaN where not used. The noise is their scatter over frames; of one frame
+    it is that of the slopes' variances, or unknown. 0 where it may be by chance.
+    """
+    seen = np.isfinite(residuals)
+    counts = seen.sum(axis=0)
+    used, frames = counts > 0, int(seen.any(axis=1).sum())
+    freedom = np.count_nonzero(used) - k
+    if freedom <= 0 or (frames == 1 and variances is None):
+        return 0.0
+    mean = np.nansum(residuals, axis=0) / np.maximum(counts, 1)
+    if frames > 1:
+        squares = np.where(seen, residuals - mean, 0.0) ** 2
+        noise = squares.sum(axis=0) / np.maximum(counts - 1, 1) / np.maximum(counts, 1)
+    else:
+        noise = np.where(seen, variances, 0.0).sum(axis=0) * freedom / (freedom + k)
+    total, expected = float(np.sum(mean[used] ** 2)), float(np.sum(noise[used]))
+    by_chance = 1 + _SURELY * np.sqrt(2 / freedom * (1 if frames == 1 else frames / (frames - 1)))
+    return (total - expected) / freedom if total > by_chance * expected else 0.0
