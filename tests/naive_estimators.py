@@ -348,25 +348,48 @@ def fixed_window(
 
 
 def gravity_error(
-    image: ArrayLike, g: ArrayLike, variance: ArrayLike, excess: float = 1.0, every_pixel: bool = False
-) -> tuple[float, float]:
-    """Standard error of the centre of gravity of an image left by a background subtraction.
+    left: ArrayLike,
+    g: ArrayLike,
+    variance: ArrayLike,
+    excess: float = 1.0,
+    every_pixel: bool = False,
+    spread: float = 1.0,
+    std_px: float = 0.0,
+    reach: int = 0,
+) -> tuple[float, float, float]:
+    """Standard errors of the centre of gravity of an image left by a background subtraction, and a margin.
 
-    var_x = sum over kept pixels of ((u - x)^2 + 1/12) (v + e max(g, 0)) / (sum of the kept)^2, `g` being
-    the calibrated image and the kept pixels those above zero in `image`, or every one; 1/12 px^2 as it is not
-    known where in a pixel the flux fell.
+    var_x = sum over kept pixels of ((u - x)^2 + 1/12) var / (sum of the kept)^2, `g` being the calibrated
+    image, the kept pixels those above zero in `left`, or every one, and var = v + e g, or left^2 times the
+    number of pixels with the same noise, `spread`, where that is less. They are infinite where (sum of the
+    kept)^2 is less than 6.25 times the sum of var; the margin is the relative distance from that. In an image
+    smoothed by a Gaussian, a pixel of `g` counts as the sum, by the taps, of what the pixels around it count;
+    there, left^2 stands for three times as much, and v + e g is of the smoothed image.
     """
-    image, g = np.asarray(image, np.float64), np.asarray(g, np.float64)
-    variances = np.broadcast_to(variance, g.shape)
-    x, y = naive.centre_of_gravity(image)
-    total, var_x, var_y = 0.0, 0.0, 0.0
-    for j, v in enumerate(pixel_centres(g.shape[0])):
-        for i, u in enumerate(pixel_centres(g.shape[1])):
-            if every_pixel or image[j, i] > 0:
-                noise = variances[j, i] + excess * max(g[j, i], 0.0)
-                total += image[j, i]
-                var_x += ((u - x) ** 2 + 1 / 12) * noise
-                var_y += ((v - y) ** 2 + 1 / 12) * noise
+    left, g = np.asarray(left, np.float64), np.asarray(g, np.float64)
+    v = np.broadcast_to(variance, g.shape)
+    x, y = naive.centre_of_gravity(left)
+    u, w = np.meshgrid(pixel_centres(g.shape[1]), pixel_centres(g.shape[0]))
+    kept = np.full(g.shape, True) if every_pixel else left > 0
+    full, total = v + excess * g, float(left.sum())
+    if std_px > 0:
+        point = np.zeros((2 * reach + 1, 2 * reach + 1))
+        point[reach, reach] = 1.0
+        spread = 1 / float((smoothed(point, std_px, std_px, reach) ** 2).sum())
+    var = full if every_pixel else np.minimum(full, left**2 * spread)
+    var = np.where(kept & ((full > 0) | every_pixel), var, np.where(kept, full, 0.0))
     if total <= 0:
-        return math.inf, math.inf
-    return math.sqrt(var_x) / total, math.sqrt(var_y) / total
+        return math.inf, math.inf, math.inf
+    ratio = total**2 / (6.25 * max(float(var.sum()), 1e-300))
+    if ratio <= 1:
+        return math.inf, math.inf, abs(ratio - 1)
+    moments = [float((var * ((place - at) ** 2 + 1 / 12)).sum()) for place, at in ((u, x), (w, y))]
+    if std_px > 0:
+        smooth = np.maximum(v + excess * smoothed(g, std_px, std_px, reach), 1e-30)
+        weight = np.sqrt(np.minimum(3 * spread * left**2 / smooth, 1.0))
+        moments = [
+            float((full * smoothed(weight * (place - at), std_px, std_px, reach) ** 2).sum())
+            for place, at in ((u, x), (w, y))
+        ]
+    error_x, error_y = (math.sqrt(max(moment, 0.0)) / total for moment in moments)
+    return error_x, error_y, abs(ratio - 1)

@@ -18,10 +18,11 @@ def lit(n: int, radius: float, centre: tuple[float, float], hole: float = 0.0) -
     x = (np.arange(n)[:, None] + OFFSETS).ravel() - centre[0]
     y = (np.arange(n)[:, None] + OFFSETS).ravel() - centre[1]
     away = np.hypot(x, y[:, None])
-    return ((away < radius) & (away >= hole)).reshape(n, 16, n, 16).mean(axis=(1, 3))
+    share: NDArray[np.float64] = ((away < radius) & (away >= hole)).reshape(n, 16, n, 16).mean(axis=(1, 3))
+    return share
 
 
-def disk(flux: NDArray[np.float64], **sizes: float) -> tuple[Pupil, list[float]]:
+def disk(flux: NDArray[np.float64], **sizes: Any) -> tuple[Pupil, list[float]]:
     """Return the pupil of fluxes (n, n), of which those below a tenth are flagged, and x, y, radius."""
     layout = Layout.grid(flux.shape, pixels=SIDE, **sizes)
     pupil = pupil_of(layout, (flux.ravel() < 0.1).astype(np.uint8), 500 * flux.ravel())
@@ -65,8 +66,7 @@ def test_whole_lenslets_are_not_cut() -> None:
 
 
 def test_a_stated_size_stands() -> None:
-    sizes: dict[str, Any] = {"subaperture_m": 0.5, "diameter_m": 5.5}
-    pupil, found = disk(lit(15, 5.4, (7.2, 7.0)), **sizes)
+    pupil, found = disk(lit(15, 5.4, (7.2, 7.0)), subaperture_m=0.5, diameter_m=5.5)
     np.testing.assert_allclose(found, [7.2, 7.0, 5.5], atol=0.1)
     assert pupil.cuts
     assert pupil.error_subapertures == 0

@@ -122,7 +122,11 @@ LARGEST = 3  # out: largest magnitude of the image
 # standard errors, px, and covariance, px^2.
 X, Y, SUM, ERROR_X, ERROR_Y, COVARIANCE = range(4, 10)
 VARIANCE, EXCESS = 10, 11  # in: variance of a pixel that collects m electrons, VARIANCE + EXCESS m
-LANE_ROWS = 12
+SPREAD = 12  # in: pixels over which denoising correlates the noise
+LANE_ROWS = 13
+# Least squared ratio of the flux that stays to its noise; below it, errors are not proportional to the noise.
+_SIGNIFICANT = 6.25
+_CORRELATED = 3.0  # noise that remains after smoothing and a threshold, over that of as many pixels
 
 _COUNTING_PASSES = 24  # usually 5 to 8 are enough; outliers go on to the exact passes
 
@@ -340,14 +344,17 @@ def centre_and_error(
 ) -> None:
     """Write the centre of gravity and its errors: the propagated noise of the remaining pixels.
 
-    That of a pixel is VARIANCE + EXCESS max(m, 0), with m as measured and, if given, `variances` in place of
-    VARIANCE; `image` may be denoised.
+    That of a pixel is VARIANCE + EXCESS m, with m as measured and, if given, `variances` in place of
+    VARIANCE; `image` may be denoised. Pixels that noise alone raises above the threshold vary less, as most
+    of them would be zero in another frame: on average by the square of what remains. Errors of a flux that
+    is not significant are infinite.
     """
     width = width_of(lanes)
     zero = splat(lanes, 0.0)
     threshold = load(lanes, lane_values, THRESHOLD * width)
     offset = select(load(lanes, lane_values, SUBTRACT * width) > zero, threshold, zero)
     v, e = load(lanes, lane_values, VARIANCE * width), load(lanes, lane_values, EXCESS * width)
+    spread = load(lanes, lane_values, SPREAD * width)
     total, moment_x, moment_y = zero, zero, zero
     noise, noise_x, noise_xx, noise_y, noise_yy, noise_xy = zero, zero, zero, zero, zero, zero
     for y in range(ny):
@@ -358,7 +365,10 @@ def centre_and_error(
             left = select(g >= threshold, g - offset, zero)
             row, row_x = row + left, multiply_add(left, column, row_x)
             own = variance_of(lanes, variances, place + here, v)
-            variance = multiply_add(maximum(load(lanes, measured, here), zero), e, own)
+            variance = multiply_add(load(lanes, measured, here), e, own)
+            above = g - threshold
+            by_noise = above * above * spread < maximum(variance, zero)
+            variance = select(by_noise, left * left * spread, variance)
             variance = select(absolute(left) > zero, variance, zero)
             away = variance * column
             part, part_x, part_xx = part + variance, part_x + away, multiply_add(away, column, part_xx)
@@ -369,8 +379,10 @@ def centre_and_error(
         away = part * line
         noise_y, noise_yy = noise_y + away, multiply_add(away, line, noise_yy)
     inverse = _store_centre(lanes, total, moment_x, moment_y, lane_values)
-    _store_error(lanes, noise, noise_x, noise_xx, inverse, X, ERROR_X, lane_values)
-    _store_error(lanes, noise, noise_y, noise_yy, inverse, Y, ERROR_Y, lane_values)
+    significant = total * total > splat(lanes, _SIGNIFICANT) * noise
+    relative = select(significant, inverse, splat(lanes, math.inf))
+    _store_error(lanes, noise, noise_x, noise_xx, relative, X, ERROR_X, lane_values)
+    _store_error(lanes, noise, noise_y, noise_yy, relative, Y, ERROR_Y, lane_values)
     at_x, at_y = load(lanes, lane_values, X * width), load(lanes, lane_values, Y * width)
     around = noise_xy - at_x * noise_y - at_y * (noise_x - at_x * noise)
     store(lane_values, COVARIANCE * width, around * inverse * inverse)
@@ -386,4 +398,57 @@ def _store_error(
     # The position of the flux within a pixel is unknown: px^2 / 12.
     around = multiply_add(noise, multiply_add(at, at, splat(lanes, 1.0 / 12.0)), second)
     around = multiply_add(first, splat(lanes, -2.0) * at, around)
-    store(lane_values, error * width, square_root(maximum(around, splat(lanes, 0.0))) * inverse)
+    value = square_root(maximum(around, splat(lanes, 0.0))) * inverse
+    store(lane_values, error * width, select(inverse < splat(lanes, math.inf), value, inverse))
+
+
+@compiled
+def errors_of_smoothed(
+    lanes: Any,
+    measured: Any,
+    variances: Any,
+    place: Any,
+    image: Any,
+    ny: Any,
+    nx: Any,
+    smoothing: Any,
+    lane_values: Any,
+) -> None:
+    """Replace finite errors of `centre_and_error` by those of a smoothed image.
+
+    The smoothing is its own adjoint: a pixel as measured moves the centre by the smoothed weights of the
+    pixels that remain. `smoothing` is reach, taps, and memory of three images.
+    """
+    reach, taps, weights = smoothing
+    width = width_of(lanes)
+    size = ny * nx * width
+    half, of_x, of_y = weights[:size], weights[size : 2 * size], weights[2 * size : 3 * size]
+    zero, tiny = splat(lanes, 0.0), splat(lanes, 1e-30)
+    threshold = load(lanes, lane_values, THRESHOLD * width)
+    at_x, at_y = load(lanes, lane_values, X * width), load(lanes, lane_values, Y * width)
+    v, e = load(lanes, lane_values, VARIANCE * width), load(lanes, lane_values, EXCESS * width)
+    spread = load(lanes, lane_values, SPREAD * width) * splat(lanes, _CORRELATED)
+    for y in range(ny):
+        for x in range(nx):
+            here = (y * nx + x) * width
+            g = load(lanes, image, here)
+            own = maximum(multiply_add(g, e, variance_of(lanes, variances, place + here, v)), tiny)
+            above = maximum(g - threshold, zero)
+            weight = square_root(minimum(above * above * spread, own) / own)
+            store(of_x, here, weight * (_from_middle(lanes, x, nx) - at_x))
+            store(of_y, here, weight * (_from_middle(lanes, y, ny) - at_y))
+    smooth_group(lanes, of_x, ny, nx, reach, taps, half, of_x)
+    smooth_group(lanes, of_y, ny, nx, reach, taps, half, of_y)
+    noise_xx, noise_yy, noise_xy = zero, zero, zero
+    for i in range(0, size, width):
+        own = variance_of(lanes, variances, place + i, v)
+        variance = multiply_add(load(lanes, measured, i), e, own)
+        x, y = load(lanes, of_x, i), load(lanes, of_y, i)
+        noise_xx, noise_yy = multiply_add(variance * x, x, noise_xx), multiply_add(variance * y, y, noise_yy)
+        noise_xy = multiply_add(variance * x, y, noise_xy)
+    inverse = splat(lanes, 1.0) / maximum(load(lanes, lane_values, SUM * width), tiny)
+    for row, noise in ((ERROR_X, noise_xx), (ERROR_Y, noise_yy)):
+        before = load(lanes, lane_values, row * width)
+        error = square_root(maximum(noise, zero)) * inverse
+        store(lane_values, row * width, select(before < splat(lanes, math.inf), error, before))
+    store(lane_values, COVARIANCE * width, noise_xy * inverse * inverse)

@@ -31,14 +31,15 @@ _find_threshold = brightest.find_threshold
 _subtract_background = brightest.subtract_background
 _centre_of_gravity = brightest.centre_of_gravity
 _centre_and_error = brightest.centre_and_error
+_errors_of_smoothed = brightest.errors_of_smoothed
 _find_largest = brightest.find_largest
 
 INFEASIBLE_STRENGTH = int(SubapertureFlag.INFEASIBLE_STRENGTH)
 NOT_CONVERGED = int(SubapertureFlag.NOT_CONVERGED)
 
 # Rows of the settings' table that follow the common ones.
-STRENGTH, TOLERANCE, LIMIT, RANK, SUBTRACT, FLOOR, LEVEL = range(COMMON_ROWS, COMMON_ROWS + 7)
-SETTING_ROWS = COMMON_ROWS + 7
+STRENGTH, TOLERANCE, LIMIT, RANK, SUBTRACT, FLOOR, LEVEL, SPREAD = range(COMMON_ROWS, COMMON_ROWS + 8)
+SETTING_ROWS = COMMON_ROWS + 8
 
 
 class GravityTables(NamedTuple):
@@ -90,8 +91,7 @@ def locate_gravity(group: Any, tables: Any, scratch: Any, stages: Any) -> None:
         scatter_images(width, denoised, first, stages[DENOISED, group.frame])
     _set_threshold(lanes, denoised, ny * nx, own.centroid)
     if settings[VARIANCE, first] >= 0.0:
-        place = first * ny * nx
-        _centre_and_error(lanes, scratch.image, group.variances, place, denoised, ny, nx, own.centroid)
+        _locate_with_error(taps, group, scratch.image, denoised, own)
     else:
         _centre_of_gravity(lanes, denoised, ny, nx, own.centroid)
     if stages.shape[0] > 0:
@@ -121,6 +121,17 @@ def _first_step(
 
 
 @compiled
+def _locate_with_error(taps: Any, group: Any, image: Any, denoised: Any, own: Any) -> None:
+    """Write the centre of gravity of a denoised image, and its errors."""
+    lanes, ny, nx = group.lanes, group.ny, group.nx
+    variances, place = group.variances, group.first * ny * nx
+    _centre_and_error(lanes, image, variances, place, denoised, ny, nx, own.centroid)
+    if taps is not None:
+        smoothing = taps.shape[2] - 1, own.rows, own.state
+        _errors_of_smoothed(lanes, image, variances, place, denoised, ny, nx, smoothing, own.centroid)
+
+
+@compiled
 def _read_settings(width: Any, first: Any, settings: Any, denoiser: Any, counts: Any, centroid: Any) -> None:
     """Copy the settings of the lanes' sub-apertures."""
     for lane in range(width):
@@ -136,6 +147,7 @@ def _read_settings(width: Any, first: Any, settings: Any, denoiser: Any, counts:
         centroid[brightest.THRESHOLD * width + lane] = settings[LEVEL, s]
         centroid[brightest.VARIANCE * width + lane] = settings[VARIANCE, s]
         centroid[brightest.EXCESS * width + lane] = settings[EXCESS, s]
+        centroid[brightest.SPREAD * width + lane] = settings[SPREAD, s]
 
 
 @compiled

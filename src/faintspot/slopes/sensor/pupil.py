@@ -108,7 +108,7 @@ def _disk_of(at: Floats, light: Floats, sides: int) -> tuple[Floats, float, NDAr
     def share(disk: Floats, of: Floats) -> Floats:
         away = np.abs(of - disk[:2]) + 1e-9
         distance = np.hypot(*away.T)
-        return np.clip(0.5 + (disk[2] - distance) * distance / away.sum(axis=1), 0.0, 1.0)
+        return np.asarray(np.clip(0.5 + (disk[2] - distance) * distance / away.sum(axis=1), 0.0, 1.0))
 
     def misfit(disk: Floats) -> float:
         missing = np.maximum(share(disk, beside) - 0.5, 0.0)
@@ -123,17 +123,17 @@ def _disk_of(at: Floats, light: Floats, sides: int) -> tuple[Floats, float, NDAr
         minimize(misfit, start, method="Nelder-Mead", options={**options, "initial_simplex": start + steps})
         for start in (_around(at[lit]), np.append(middle, most))
     ]
-    disk = min(fits, key=lambda fit: float(fit.fun)).x
+    disk: Floats = min(fits, key=lambda fit: float(fit.fun)).x
     around = _around(at[lit])
     low, high = at[lit].min(axis=0) - 0.5, at[lit].max(axis=0) + 0.5
     lacking = ((beside > low) & (beside < high)).all(axis=1)
     if float((1 - light).sum()) + 0.5 * np.count_nonzero(lacking) < misfit(disk):
         return around, 0.0, lit, False  # a square array
-    inside = lit & (np.hypot(*(at - disk[:2]).T) < disk[2] + 0.5)
+    inside = np.asarray(lit & (np.hypot(*(at - disk[:2]).T) < disk[2] + 0.5))
     around = _around(at[inside])
     edge = np.abs(np.hypot(*(at - disk[:2]).T) - disk[2]) < 1
     partly = np.abs(light[edge] - 0.5) < _PARTLY
-    cuts = misfit(around) > misfit(disk) + _WHOLE and np.count_nonzero(partly) > _CUT * len(partly)
+    cuts = misfit(around) > misfit(disk) + _WHOLE and float(np.sum(partly)) > _CUT * len(partly)
     disk = disk if cuts else around
     difference = light[edge] - share(disk, at[edge])
     # Differences of neighbours are alike: of four, about one is independent.

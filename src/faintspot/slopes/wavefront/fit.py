@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.special import stdtrit
 
-from faintspot.base.checks import number_between
+from faintspot.base.checks import not_none, number_between
 from faintspot.base.errors import InputError
-from faintspot.base.flags import SubapertureFlag, leave_out
+from faintspot.base.flags import SubapertureFlag, are_valid, leave_out
 from faintspot.slopes.pipeline.slopes import Slopes
 from faintspot.slopes.sensor.layout import Layout
 from faintspot.slopes.sensor.pupil import Pupil, inside_pupil, lenslet_outlines, lit_outlines, pupil_of
@@ -247,16 +247,20 @@ def fit_wavefront(slopes: Slopes, layout: Layout, *, modes: int | None = None) -
         raise InputError(f"slopes: expected {len(layout)} sub-apertures, as in the layout, got {x.shape[-1]}")
     pupil = pupil_of(layout, flags, slopes.flux)
     outlines, share = _in_pupil(layout, pupil)
-    valid, left_out = leave_out(flags, slopes.keep, {"outside the pupil": share < _LEAST_SHARE})
+    errors = np.concatenate(
+        [np.atleast_2d(getattr(slopes, f"standard_error_{axis}")) for axis in "xy"], axis=1
+    )
+    # Of slopes of which most have standard errors, the others are not significant.
+    unsure = are_valid(flags, slopes.keep) & ~np.isfinite(errors).reshape(len(flags), 2, -1).all(axis=1)
+    unsure &= 2 * np.count_nonzero(unsure) < np.count_nonzero(are_valid(flags, slopes.keep))
+    others = {"outside the pupil": share < _LEAST_SHARE, "not significant": unsure}
+    valid, left_out = leave_out(flags, slopes.keep, others)
     illuminated = np.asarray(valid.any(axis=0))
     if np.count_nonzero(illuminated) < _FEWEST_SUBAPERTURES:
         raise _too_few(illuminated, left_out)
     settled = (valid & (flags & int(SubapertureFlag.NOT_CONVERGED) == 0)).any(axis=0)
     gradients, condition = _chosen_gradients(modes, outlines, illuminated, int(np.count_nonzero(settled)))
     unit, scale = _unit_of(layout, pupil)
-    errors = np.concatenate(
-        [np.atleast_2d(getattr(slopes, f"standard_error_{axis}")) for axis in "xy"], axis=1
-    )
     used = np.tile(valid, 2)
     has_errors = bool(np.isfinite(errors[used]).all())
     noise = np.square(errors, dtype=np.float64), np.atleast_2d(slopes.covariance_xy).astype(np.float64)
@@ -426,7 +430,7 @@ def _unexplained(residuals: Floats, k: int, variances: Floats | None) -> float:
         squares = np.where(seen, residuals - mean, 0.0) ** 2
         noise = squares.sum(axis=0) / np.maximum(counts - 1, 1) / np.maximum(counts, 1)
     else:
-        noise = np.where(seen, variances, 0.0).sum(axis=0) * freedom / (freedom + k)
+        noise = np.where(seen, not_none(variances), 0.0).sum(axis=0) * freedom / (freedom + k)
     total, expected = float(np.sum(mean[used] ** 2)), float(np.sum(noise[used]))
     by_chance = 1 + _SURELY * np.sqrt(2 / freedom * (1 if frames == 1 else frames / (frames - 1)))
     return (total - expected) / freedom if total > by_chance * expected else 0.0

@@ -150,7 +150,7 @@ class GravityPlan(EstimatorPlan):
 
     def fill(self, table: NDArray[np.float32]) -> None:
         """See `EstimatorPlan`."""
-        table[gravity.FLOOR] = self.each("flux_floor")
+        table[gravity.FLOOR], table[gravity.SPREAD] = self.each("flux_floor"), 1.0
 
     def fill_flux(self, table: NDArray[np.float32], flux_e: Floats) -> None:
         """See `EstimatorPlan`."""

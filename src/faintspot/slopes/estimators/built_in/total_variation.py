@@ -25,6 +25,7 @@ from faintspot.slopes.kernels.flat_start import flat_start_table
 
 _STRENGTHS = (1.0, 0.4, 0.6, 0.8, 1.25)  # multiples of the automatic strength
 _LEAST_STRENGTH_E = 1e-3
+_SPREAD = 1.5  # pixels with the same noise after denoising, in simulations
 _LIMITS = "tolerance", "max_iterations"
 
 
@@ -55,7 +56,7 @@ class _TotalVariationPlan(GravityPlan):
         super().fill_flux(table, flux_e)
         automatic = is_auto(self.estimator.noise_std)
         strength = automatic_strength(**self.rule_arguments(flux_e)) if automatic else self.each("noise_std")
-        table[gravity.STRENGTH] = strength
+        table[gravity.STRENGTH], table[gravity.SPREAD] = strength, np.where(strength > 0, _SPREAD, 1.0)
 
 
 @register
@@ -197,6 +198,13 @@ class _SmoothedPlan(GravityPlan):
 
         std = np.repeat(self.each("smoothing_px")[:, None], 2, axis=1)
         return gravity.GravityTables(taps=gaussian_taps(std, self.sensor.window))
+
+    def fill(self, table: NDArray[np.float32]) -> None:
+        """See `EstimatorPlan`."""
+        super().fill(table)
+        # Taps are (n, 2, 1 + reach), the central one first.
+        squares = self.tables.taps.astype(np.float64) ** 2
+        table[gravity.SPREAD] = 1 / np.prod(2 * squares.sum(axis=2) - squares[:, :, 0], axis=1)
 
 
 @register
