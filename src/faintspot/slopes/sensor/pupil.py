@@ -5,8 +5,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import minimize
-from scipy.spatial import cKDTree
 
 from faintspot.base.errors import InputError
 from faintspot.base.flags import UNMEASURED, SubapertureFlag
@@ -101,6 +99,9 @@ def _disk_of(at: Floats, light: Floats, sides: int) -> tuple[Floats, float, NDAr
 
     Lengths are in pitches: of lenslets at (n, 2), with relative flux `light` (n,), and 4 or 6 neighbours.
     """
+    from scipy.optimize import minimize  # imported here: they take longer than the first slopes
+    from scipy.spatial import cKDTree
+
     turns = 2 * np.pi * np.arange(sides) / sides
     beside = (at[:, None] + np.stack([np.cos(turns), np.sin(turns)], axis=-1)).reshape(-1, 2)
     beside = beside[cKDTree(at).query(beside)[0] > 0.5]  # not in the layout: they have no more than half
