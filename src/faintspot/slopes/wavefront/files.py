@@ -53,7 +53,7 @@ def mode_table(wavefront: Wavefront, most: int | None = None) -> tuple[list[str]
         rows.append([*row, f"{of_frames:.{digits}f}"] if several else row)
     if most is not None and len(rows) > most + 1:
         last, rest = wavefront.modes[-1], [NOTHING, f"{total(wavefront.mean[most:]):.{digits}f}", NOTHING]
-        name = f"to Z{last}, root sum of squares (--modes {len(rows)}: each)"
+        name = f"to Z{last}, rms (--modes {len(rows)})"
         row = [rows[most][0], name, *rest, f"{total(wavefront.rms_of_frames[most:]):.{digits}f}"]
         rows[most:] = [row if several else row[:-1]]
     return [*header, f"rms of frames ({unit})"] if several else header, rows
