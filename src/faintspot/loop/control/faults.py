@@ -233,18 +233,32 @@ def followers(slopes: Floats) -> Mask:
 
 
 def silent_subapertures(slopes: Floats, steps: Floats) -> Mask:
-    """Return the sub-apertures whose slopes hardly take part in the steps that correct the wavefront, (n,).
+    """Return the sub-apertures whose slopes neither take part in steps of the mirror nor answer them, (n,).
 
-    Whatever law computed the steps, slopes of a wavefront are a part of them. If more than a quarter of the
-    sub-apertures seem to be silent, the matrix is another one, and none is returned.
+    Whatever law computed the steps, slopes of a wavefront are a part of them, and change with them a few frames
+    later. If more than a quarter seem to be silent, the matrix is another one, and none is returned.
 
     Parameters
     ----------
     slopes : (frames, 2 n) array
         NaN where not measured.
-    steps : (frames, 2 n) array
-        Steps of the commands that were computed from them, in slopes.
+    steps : (frames - 1, 2 n) array
+        Steps of the commands that were computed from all but the first, in slopes.
     """
+    change = np.diff(slopes, axis=0)
+    later = [_responses(change[delay:], steps[:-delay]) for delay in _DELAYS]
+    later = [fit for fit in later if fit[2] > _LATER]
+    silent = np.zeros(slopes.shape[1] // 2, np.bool_)
+    for response, error, usual in [
+        _responses(-slopes[1:], steps),
+        *sorted(later, key=lambda fit: -fit[2])[:1],
+    ]:
+        silent |= np.abs(response) + _SURE * error < _SILENT * abs(usual)
+    return np.asarray(silent & (silent.mean() <= _MOST_ALIKE))
+
+
+def _responses(slopes: Floats, steps: Floats) -> tuple[Floats, Floats, float]:
+    """Return regressions of slopes on steps by sub-aperture, their errors, and their median."""
     measured = np.isfinite(slopes)
     sent, seen = np.where(measured, steps, 0.0), np.where(measured, slopes, 0.0)
     seen -= np.where(measured, seen.sum(axis=0) / np.maximum(measured.sum(axis=0), 1), 0.0)
@@ -253,13 +267,9 @@ def silent_subapertures(slopes: Floats, steps: Floats) -> Mask:
         for one, other in ((sent, sent), (seen, seen), (sent, seen))
     )
     known = power > 0
-    if not known.any():
-        return np.zeros(len(power), np.bool_)
-    response = np.where(known, product / np.where(known, power, 1.0), np.nan)
-    usual = float(np.nanmedian(response))
-    error = np.sqrt(size / np.maximum(power, 1e-300) / len(slopes))
-    silent = known & (np.abs(response) + _SURE * error < _SILENT * abs(usual))
-    return np.asarray(silent & (silent.mean() <= _MOST_ALIKE))
+    response = np.where(known, product / np.where(known, power, 1.0), 0.0)
+    error = np.where(known, np.sqrt(size / np.where(known, power, 1.0) / max(len(slopes), 1)), math.inf)
+    return response, error, float(np.median(response[known])) if known.any() else 0.0
 
 
 def still_actuators(slopes: Floats, commands: Floats, interaction: Floats) -> Mask:

@@ -50,7 +50,8 @@ _REGULAR = 0.9  # least part of the gaps between exposures that are whole number
 _NAMED = 5  # sub-apertures in a remark
 _BROKEN = 1e6  # rms of a slope relative to the median one
 _LARGEST = 1e30  # whose square is a number
-_PARTS, _MANY_ERRORS = 16, 10.0  # of a recording; standard errors of a mean that is not 0
+_PARTS, _NOT_ZERO = 16, 3.0  # of a recording; rms of the means of slopes that are not 0, in standard errors
+_HELD, _HELD_MODES = 10.0, 0.1  # standard errors of the mean of a mode that is held; part of all modes
 
 
 def _number(meaning: str, unit: str, low: float, high: float, *, whole: bool = False) -> Option:
@@ -265,24 +266,42 @@ def _about_offsets(recording: Recording) -> tuple[Recording, Floats, Floats]:
 
     An open loop is not about its means, which belong to the wavefront.
     """
-    names = {"reference_slopes": "slopes", "flat_command": "commands"}
-    values: dict[str, Any] = {}
-    offsets, remarks = [], []
-    for name, of in names.items():
-        array, offset = getattr(recording, of), getattr(recording, name)
-        if array is None:
-            array = np.zeros((len(recording.slopes), 0))
-        elif offset is None and recording.is_closed and (mean := _mean(array)).any():
-            offset, rms = mean, float(np.sqrt(np.square(mean).mean()))
+    found = {"reference_slopes": _reference(recording), "flat_command": _flat(recording)}
+    remarks, values = [], dict[str, Any]()
+    for name, of in (("reference_slopes", "slopes"), ("flat_command", "commands")):
+        array, stated = getattr(recording, of), getattr(recording, name)
+        if stated is not None:
+            found[name] = stated
+        elif found[name].any():
+            rms = float(np.sqrt(np.square(found[name]).mean()))
             remarks.append(f"{name.replace('_', ' ')}: the mean of the {of}, {rms:.3g} rms, is subtracted")
-        offsets.append(np.zeros(array.shape[1]) if offset is None else offset)
-        values |= {name: None, of: None if getattr(recording, of) is None else array - offsets[-1]}
+        values |= {name: None, of: None if array is None else array - found[name]}
     centred = replace(recording, remarks=(*recording.remarks, *remarks), **values)
-    return centred, offsets[0], offsets[1]
+    return centred, found["reference_slopes"], found["flat_command"]
 
 
-def _mean(values: Floats) -> Floats:
-    """Return means of columns, the medians of those of parts; 0 unless they are clearly not."""
+def _reference(loop: Recording) -> Floats:
+    """Return the mean of the slopes, (m,), if it is not 0: an integrator leaves none but the reference's."""
+    mean, in_errors = _mean(loop.slopes)
+    return mean * (loop.is_closed and np.square(in_errors).mean() > _NOT_ZERO**2)
+
+
+def _flat(loop: Recording) -> Floats:
+    """Return the mean of the commands, (commands,), in the modes of the mirror in which they hold a shape.
+
+    Turbulence leaves a mean of few standard errors, a bias one of many in a mode or two, and a shape in many
+    modes: then it is taken to be in all.
+    """
+    if loop.commands is None or loop.interaction_matrix is None or not loop.is_closed:
+        return np.zeros(0 if loop.commands is None else loop.commands.shape[1])
+    _, modes = np.linalg.eigh(loop.interaction_matrix.T @ loop.interaction_matrix)
+    mean, in_errors = _mean(loop.commands @ modes)
+    least = 0.0 if (in_errors > _HELD).mean() > _HELD_MODES else _HELD
+    return np.asarray(modes @ np.where(in_errors > least, mean, 0.0))
+
+
+def _mean(values: Floats) -> tuple[Floats, Floats]:
+    """Return means of columns, the medians of those of parts, and their size in standard errors."""
     starts = np.linspace(0, len(values), min(_PARTS, len(values)), endpoint=False).astype(int)
     known = np.isfinite(values)
     counts = np.add.reduceat(known.astype(np.int64), starts)
@@ -290,8 +309,7 @@ def _mean(values: Floats) -> Floats:
     whole = sums.sum(axis=0) / np.maximum(counts.sum(axis=0), 1)
     means = np.where(counts > 0, sums / np.maximum(counts, 1), whole)
     mean, error = np.median(means, axis=0), means.std(axis=0) / math.sqrt(len(starts))
-    in_errors = np.abs(mean[error > 0]) / error[error > 0]
-    return mean if in_errors.size and np.median(in_errors) > _MANY_ERRORS else np.zeros_like(mean)
+    return mean, np.where(error > 0, np.abs(mean) / np.where(error > 0, error, 1.0), 0.0)
 
 
 def _exposures(recording: Recording) -> Recording:
@@ -409,11 +427,13 @@ def _without_silent_subapertures(loop: Recording) -> Recording:
         return loop
     steps = np.diff(loop.commands, axis=0) @ loop.interaction_matrix.T
     steps[np.diff(loop.frame) != 1] = 0.0
-    silent = silent_subapertures(loop.slopes[1:], steps)
+    silent = silent_subapertures(loop.slopes, steps)
     if not silent.any():
         return loop
     slopes = np.where(np.tile(silent, 2), np.nan, loop.slopes)
-    remark = f"{_named(silent, loop.cells)}: slopes are unlike those that the mirror corrects"
+    remark = (
+        f"{_named(silent, loop.cells)}: slopes do not answer the mirror, or are no part of what it corrects"
+    )
     return replace(loop, slopes=slopes, remarks=(*loop.remarks, remark))
 
 
