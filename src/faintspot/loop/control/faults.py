@@ -235,8 +235,8 @@ def followers(slopes: Floats) -> Mask:
 def silent_subapertures(slopes: Floats, steps: Floats) -> Mask:
     """Return the sub-apertures whose slopes neither take part in steps of the mirror nor answer them, (n,).
 
-    Whatever law computed the steps, slopes of a wavefront are a part of them, and change with them a few frames
-    later. If more than a quarter seem to be silent, the matrix is another one, and none is returned.
+    Whatever law computed the steps, slopes of a wavefront are a part of them, and change with them later. If
+    more than a quarter seem to be silent, the matrix is another one, and none is returned.
 
     Parameters
     ----------
