@@ -47,6 +47,7 @@ _ORDER = (
     "wavefronts",
     "metrology",
     "beams",
+    "backgrounds",
     "spot_widths",
     "yardstick",
     "startup",
@@ -66,6 +67,7 @@ LONG = {
     "wavefronts",
     "metrology",
     "beams",
+    "backgrounds",
     "spot_widths",
     "yardstick",
 }

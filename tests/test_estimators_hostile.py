@@ -159,7 +159,7 @@ class TestSettings:
             search_range_px=extreme(1e-3, 0.5, 3.0, 1e4),
             flux_e=extreme(1e-3, 1.0, 1e12),
             prior_std_px=extreme(1e-6, 0.3, 1e4),
-            weight_fwhm_px=extreme(0.1, 2.0, 64.0),
+            weight_fwhm_px=extreme(0.1, 2.0, 1e3),
             spot_fwhm_px=extreme(0.1, 2.0),
             smoothing_px=extreme(0.01, 1.0, 16.0),
             threshold_e=extreme(0.0, 1e12),

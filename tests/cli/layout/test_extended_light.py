@@ -68,6 +68,16 @@ def test_background_beyond_a_stated_dark_is_reported(folder: Path, run: Commands
 
 
 @pytest.mark.usefixtures("no_trials")
+def test_spots_too_wide_for_the_largest_window_are_binned(folder: Path, run: Commands) -> None:
+    """FWHM of 54 px at a pitch of 90 px: windows of 64 px would cut them."""
+    along = sum(np.exp(-4 * np.log(2) * ((np.arange(380) - 55 - 90 * n) / 54) ** 2) for n in range(4))
+    np.save("a.npy", np.random.default_rng(1).normal(10 + 160 * np.outer(along, along), 1.5))
+    run.ok("layout", "a.npy", "-o", "new.toml")
+    layout = Layout.load("new.toml")
+    assert (len(layout), layout.bin, layout.window) == (16, 2, (90, 90))
+
+
+@pytest.mark.usefixtures("no_trials")
 @pytest.mark.parametrize("gains", [(1.0, 0.25, 0.25, 0.05), (0.6, 1.0, 1.0, 0.4)])
 def test_mosaic_is_refused(folder: Path, run: Commands, gains: tuple[float, float, float, float]) -> None:
     np.save("a.npy", mosaic_frames(gains))

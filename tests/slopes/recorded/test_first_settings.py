@@ -157,6 +157,18 @@ def test_spots_as_wide_as_their_neighbours_are_far(fwhm_px: float) -> None:
     assert 0.4 * at_edge_px < found.at_edge_px < max(1.5 * at_edge_px, 0.01)
 
 
+def test_spots_almost_as_wide_as_the_largest_window_have_settings() -> None:
+    """Also of a weight 1.6 times as wide as 54 px."""
+    away = np.arange(64) - 31.5 - np.array([[-90], [0], [90]])
+    along = np.exp(-4 * np.log(2) * (away / 54.0) ** 2).sum(axis=0)
+    images = 100 * np.outer(along, along) + np.random.default_rng(1).normal(0.0, 1.0, (2, 64, 64))
+    layout = replace(fs.Layout.stacked(2, (64, 64)), pitch_px=90.0)
+    found = first_settings(layout, fs.Calibration(dark=0.0), images.reshape(1, 128, 64))
+    assert found.fwhm_px == pytest.approx(54, rel=0.05)
+    assert found.systematic_px is not None
+    assert found.systematic_px < 0.03
+
+
 def test_spots_wider_than_their_pitch_are_doubtful() -> None:
     flat, layout = array_of_wide_spots(10.5, np.zeros((1, 2)))
     noise = np.random.default_rng(1).normal(0.0, 3.0, flat.shape)

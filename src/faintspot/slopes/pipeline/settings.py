@@ -48,10 +48,10 @@ class SharedOptions(Options):
         "Full width at half maximum of the spots in the frame, along x. Default: the width of the PSF.",
         unit="px",
         low=0.1,
-        high=64.0,
+        high=1e3,
     )
     spot_fwhm_y_px: object = option(
-        None, "As spot_fwhm_px, along y. Default: the width along x.", unit="px", low=0.1, high=64.0
+        None, "As spot_fwhm_px, along y. Default: the width along x.", unit="px", low=0.1, high=1e3
     )
 
 

@@ -1,5 +1,6 @@
 """Layout, calibration and settings to begin with, from frames of spots."""
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -20,17 +21,28 @@ from faintspot.slopes.camera.frame_checks import (
     find_hot_pixels,
     misread,
     mosaic_contrast,
-    overlap,
-    smooth_background,
-    varies,
 )
 from faintspot.slopes.camera.photon_transfer import measure_detector
-from faintspot.slopes.recorded.first_settings import ASSUMED_NOISE_E, FirstSettings, first_settings
+from faintspot.slopes.recorded.first_settings import (
+    ASSUMED_NOISE_E,
+    WIDEST_PX,
+    FirstSettings,
+    first_settings,
+)
 from faintspot.slopes.recorded.survey import UsualFrames, survey
+from faintspot.slopes.sensor.background import (
+    least_difference,
+    lenslet_background,
+    overlap,
+    values_at,
+    varies,
+)
 from faintspot.slopes.sensor.binning import scaled_points
 from faintspot.slopes.sensor.found_layout import FoundLayout, KnownGrid, find_illuminated, find_layout
 from faintspot.slopes.sensor.layout import OPTICS, Layout
-from faintspot.slopes.sensor.window_checks import window_size
+from faintspot.slopes.sensor.region import neighbour_vectors
+from faintspot.slopes.sensor.window_checks import LARGEST_WINDOW, window_size
+from faintspot.slopes.spots.shapes import FWHM_TO_STD
 
 Floats = NDArray[np.float64]
 
@@ -161,12 +173,18 @@ def first_layout(
     hot = find_hot_pixels(mean) if mask_hot_pixels else np.empty((0, 2), np.int64)
     mean[tuple(hot.T)] = np.nan
     shown, unused = (mean, []) if grid is not None else _clearer_frame(mean, calibration)
-    if factor > 1:
-        shown, options = binned(shown, factor).astype(np.float64), _binned_options(options, factor)
+
+    def found_in_bins(factor: int) -> FoundLayout | KnownGrid:
+        if factor == 1:
+            return _found(shown, grid, calibration.dark is not None, options)
+        image, choices = binned(shown, factor).astype(np.float64), _binned_options(options, factor)
+        return _found(image, grid, calibration.dark is not None, choices).magnified(factor, source.shape)
+
     with errors_within(source.description):
-        found = _found(shown, grid, calibration.dark is not None, options)
-    if factor > 1:
-        found = found.magnified(factor, source.shape)
+        found = found_in_bins(factor)
+        if factor == 1 and (factor := _needed_bin(found, options)) > 1:
+            found = found_in_bins(factor)
+            unused.append(f"bin {factor}: windows of {LARGEST_WINDOW} px would cut such wide spots")
     found = found[_kept(len(found.layout), exclude)]
     layout = replace(found.layout, **optics, doubts=found.doubts)
     result = _Completed(calibration, unused + notes)
@@ -215,6 +233,13 @@ def _found(
             "--flat with a flat field in the same light corrects them"
         )
     return found
+
+
+def _needed_bin(found: FoundLayout | KnownGrid, options: Mapping[str, Any]) -> int:
+    """Return the smallest bin in whose pixels the largest window holds the weight of a spot."""
+    if isinstance(found, KnownGrid) or options.get("pixels") is not None:
+        return 1
+    return math.ceil(found.lenslets.spot_px / FWHM_TO_STD / WIDEST_PX)
 
 
 def _kept(count: int, excluded: Sequence[int]) -> NDArray[np.bool_]:
@@ -389,7 +414,9 @@ class _Completed:
 def _background(found: FoundLayout, mean: Floats) -> tuple[Floats, Floats | None]:
     """Return the background at each spot, and of all pixels, if it varies enough to change slopes."""
     grid = found.lenslets
-    background = smooth_background(mean, grid.spots, grid.pitch_px, grid.spot_px)
-    column, row = np.clip(np.rint(grid.spots).astype(int), 0, np.array(mean.shape[::-1]) - 1).T
-    levels, flux = background[row, column], float(np.median(grid.flux))
-    return levels, background if varies(mean, levels, flux, grid.pitch_px, grid.spot_px) else None
+    spots = grid.spots @ np.array([1, 1j])
+    beside = neighbour_vectors(grid.geometry, grid.pitch_px, grid.angle_deg)
+    background = lenslet_background(mean, spots, beside, grid.pitch_px, grid.spot_px)
+    levels, flux = values_at(background, spots), float(np.median(grid.flux))
+    least = least_difference(mean, flux, grid.pitch_px, grid.spot_px)
+    return levels, background if varies(levels, least) else None

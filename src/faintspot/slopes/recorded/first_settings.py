@@ -18,7 +18,8 @@ from faintspot.slopes.pipeline.settings import Settings
 from faintspot.slopes.pipeline.slope_pipeline import SlopePipeline
 from faintspot.slopes.sensor.binning import binned_layout
 from faintspot.slopes.sensor.layout import Layout
-from faintspot.slopes.sensor.region import neighbours_of
+from faintspot.slopes.sensor.region import neighbour_vectors, neighbours_of
+from faintspot.slopes.sensor.window_checks import LARGEST_WINDOW
 from faintspot.slopes.spots.psf import PSF
 from faintspot.slopes.spots.shapes import FWHM_TO_STD
 
@@ -32,6 +33,8 @@ _WEIGHTS = (1.25, 1.6)  # width of the weight over the spot's: best where read n
 # Likewise where spots overlap (width over the pitch), and where they are sharper than Nyquist sampling.
 _OVERLAPPING, _WIDEST, _NARROW_WEIGHTS = 0.35, 0.75, (0.25, 0.35, 0.5, 0.7, 0.9)
 _SHARP_PX, _WIDE_WEIGHTS = 2.2, (2.5, 4.0, 6.0)
+WIDEST_PX = LARGEST_WINDOW / _WEIGHTS[-1]
+"""Full width at half maximum of spots whose widest weight fills the largest window."""
 # Systematic error accepted if any weight reaches it, at most that part of the least error with noise; and the
 # one that is doubtful.
 _SYSTEMATIC_PX, _OF_ERROR, _DOUBTFUL_PX = 0.015, 0.1, 0.03
@@ -193,17 +196,6 @@ def _photon_noise(images: Floats, noise: float, flux: float) -> float:
     return float(max(np.median(squares) - pixels * noise**2, 0.0) / flux)
 
 
-def _neighbours(layout: Layout) -> NDArray[np.complex128]:
-    """Return the vectors x + iy from a spot to its neighbours [px]."""
-    around = np.array([1, 1j, -1, -1j, 1 + 1j, -1 + 1j, -1 - 1j, 1 - 1j])
-    if layout.geometry == "hexagonal":
-        around = np.exp(1j * np.pi / 3 * np.arange(6))
-    away: NDArray[np.complex128] = (
-        float(layout.pitch_px or 0) * around * np.exp(1j * np.radians(layout.angle_deg))
-    )
-    return away
-
-
 def _centred(image: Floats) -> Floats:
     """Return an image moved by a spline so that the middle of what is above half its height is central."""
     above = np.maximum(image - 0.5 * (image.max() + np.median(image)), 0.0)
@@ -221,7 +213,9 @@ class _Trial:
         self._truth = self._displacement * rng.standard_normal((_SPOTS, 2))
         self._pitch_px, self._is_hidden = layout.pitch_px or math.inf, False
         overlap = self.fwhm_px > _OVERLAPPING * self._pitch_px
-        self._around = _neighbours(layout) if overlap else np.zeros(0, complex)
+        self._around = np.zeros(0, complex)
+        if overlap:
+            self._around = neighbour_vectors(layout.geometry, self._pitch_px, layout.angle_deg)
         inwards = np.exp(2j * np.pi * rng.random(_SPOTS))
         inwards[::2] = 0
         if overlap:

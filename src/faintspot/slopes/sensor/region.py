@@ -101,6 +101,14 @@ def neighbours_of(cells: NDArray[np.int64], geometry: str, *, diagonal: bool = F
     return np.column_stack([index[shifted[:, 0] + row, shifted[:, 1] + column] for row, column in steps])
 
 
+def neighbour_vectors(geometry: str, pitch_px: float, angle_deg: float) -> NDArray[np.complex128]:
+    """Return the vectors x + iy from a lenslet to its neighbours, diagonal ones in square arrays too [px]."""
+    around = np.array([1, 1j, -1, -1j, 1 + 1j, -1 + 1j, -1 - 1j, 1 - 1j])
+    if geometry == "hexagonal":
+        around = np.exp(1j * np.pi / 3 * np.arange(6))
+    return np.asarray(pitch_px * around * np.exp(1j * np.radians(angle_deg)))
+
+
 def lines_of(neighbours: NDArray[np.int64], multiple: int) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
     """Return pairs of cells in line with each cell, from the table that `neighbours_of` returns.
 

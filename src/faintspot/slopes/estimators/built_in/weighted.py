@@ -164,7 +164,7 @@ class Weighted(Stepping):
         "elongation of the spot. Default: the width of the spot.",
         unit="px",
         low=0.1,
-        high=64.0,
+        high=1e3,
     )
     preset: str = option(
         "accurate",

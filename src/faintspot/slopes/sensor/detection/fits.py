@@ -6,6 +6,7 @@ import numpy as np
 import scipy.ndimage
 from numpy.typing import NDArray
 
+from faintspot.slopes.sensor.background import least_difference, lenslet_background, values_at
 from faintspot.slopes.sensor.detection.acquisition import follow
 from faintspot.slopes.sensor.detection.candidates import Lattice, find_candidates
 from faintspot.slopes.sensor.detection.illumination import (
@@ -20,13 +21,15 @@ from faintspot.slopes.sensor.detection.nodes import (
     SpotFlux,
     find_spots,
     inside_frame,
+    levels_between,
     measure_nodes,
     no_drift,
     spot_width,
 )
-from faintspot.slopes.sensor.region import PupilRegion, as_rows, as_tree
+from faintspot.slopes.sensor.region import PupilRegion, as_rows, as_tree, neighbour_vectors
 
 _FIT_PASSES = 10
+_REFITS = 3  # at most, without a background that varies
 # A spot with this signal-to-noise ratio that is as bright as those of illuminated lenslets and this far
 # (pitches) from all of them belongs to another lenslet: a smooth aberration brings no two spots closer.
 _CLEAR, _ELSEWHERE = 6.0, 0.4
@@ -133,6 +136,13 @@ def best_fit(
             best, highest = fit, rank
     if best is None:
         return None
+    for _ in range(_REFITS):
+        if (even := _without_background(image, best)) is None:
+            break
+        fit = _fitted(even, best.lattice, illuminated_fraction, pupil)
+        if fit.lit < FEWEST:
+            break
+        best = fit
     if pupil is not None:
         held = pupil.holds(best.lattice.positions(best.spots.cells))
         beyond = best.spots.positions[best.illuminated.nodes & ~held]
@@ -141,6 +151,31 @@ def best_fit(
     return replace(
         best, illuminated=replace(best.illuminated, doubt=_unclear(best) or best.illuminated.doubt)
     )
+
+
+def _without_background(image: NDArray[np.float64], fit: LatticeFit) -> NDArray[np.float64] | None:
+    """Return an image without its background if that ends with the lit lenslets, otherwise None.
+
+    Sky that is seen through lit lenslets only looks like the side of a spot at the edge of the pupil.
+    """
+    lattice, lit = fit.lattice, fit.illuminated.nodes
+    at = lattice.positions(fit.spots.cells) + fit.spots.drifts
+    beside = lattice.neighbours(fit.spots.cells)
+    at_edge = np.append(~lit, False)[beside] & lit[:, None]
+    if not at_edge.any():
+        return None
+    flux = float(np.median(fit.spots.flux[lit]))
+    least = least_difference(image, flux, lattice.pitch_px, fit.width_px)
+
+    def ends(levels: NDArray[np.float64]) -> bool:
+        steps = levels[:, None] - np.append(levels, np.nan)[beside]
+        return bool(np.median(steps[at_edge]) > least)
+
+    if not ends(levels_between(image, lattice, at)):
+        return None
+    around = neighbour_vectors(lattice.geometry, lattice.pitch_px, lattice.angle_deg)
+    background = lenslet_background(image, at[lit], around, lattice.pitch_px, fit.width_px)
+    return image - background if ends(values_at(background, at)) else None
 
 
 def _fitted(

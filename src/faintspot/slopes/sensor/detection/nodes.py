@@ -108,7 +108,8 @@ def measure_nodes(
     drift : function
         Function that returns the expected displacements [px] of the spots of nodes at x + 1j * y.
     """
-    band = _band(image, _haze(image, lattice), width_px)
+    haze = _haze(image, lattice)
+    band = _band(image, haze, width_px)
     margin_px = _MARGIN * lattice.pitch_px
     cells = lattice.cells_inside(image.shape, margin_px if drift is no_drift else -REACH * lattice.pitch_px)
     drifts = drift(lattice.positions(cells))
@@ -116,17 +117,28 @@ def measure_nodes(
     inside = inside_frame(at, image.shape, margin_px - 0.5)
     cells, drifts, at = cells[inside], drifts[inside], at[inside]
     peaks, _ = _peaks(band, lattice, at)
-    spots = _measured(image, band, lattice, width_px, peaks)
+    spots = _measured(image, band, haze, lattice, width_px, peaks)
     return NodeFlux(**vars(spots), cells=cells, drifts=drifts, shifts=(peaks - at) / lattice.pitch_px)
 
 
 def find_spots(image: NDArray[np.float64], lattice: Lattice, width_px: float) -> SpotFlux:
     """Measure all peaks of a frame that are clearly spots, at any position."""
-    band = _band(image, _haze(image, lattice), width_px)
+    haze = _haze(image, lattice)
+    band = _band(image, haze, width_px)
     side = 2 * max(1, int(_APART * lattice.pitch_px)) + 1
     high = (band == scipy.ndimage.maximum_filter(band, side)) & (band > _CERTAIN * _noise(band, lattice))
     y, x = np.nonzero(high)
-    return _measured(image, band, lattice, width_px, x + 1j * y)
+    return _measured(image, band, haze, lattice, width_px, x + 1j * y)
+
+
+def levels_between(
+    image: NDArray[np.float64], lattice: Lattice, at: NDArray[np.complex128]
+) -> NDArray[np.float64]:
+    """Return the median (n,) of the pixels around each node that are nearer to it than to its neighbours."""
+    offsets = _disc(max(0.5 * lattice.pitch_px, 2.0))
+    values = _around(image, at, offsets[np.abs(offsets) > SEARCH * lattice.pitch_px])
+    values[np.isnan(values).all(axis=1)] = 0.0
+    return np.asarray(np.nanmedian(values, axis=1))
 
 
 def inside_frame(at: NDArray[np.complex128], shape: tuple[int, ...], margin_px: float) -> NDArray[np.bool_]:
@@ -139,6 +151,7 @@ def inside_frame(at: NDArray[np.complex128], shape: tuple[int, ...], margin_px: 
 def _measured(
     image: NDArray[np.float64],
     band: NDArray[np.float64],
+    haze: NDArray[np.float64],
     lattice: Lattice,
     width_px: float,
     peaks: NDArray[np.complex128],
@@ -162,14 +175,24 @@ def _measured(
     flux = (residual[:, near] + fitted).sum(axis=1)
     explained = (fitted**2).sum(axis=1)
     height = np.maximum(numbers[:, 3], 1e-30)
+    slopes = numbers[:, 1:3] / lattice.pitch_px + _leaning(residual, offsets, spot)
     return SpotFlux(
-        peaks + _subpixel(band, peaks),
+        peaks + _subpixel(band + haze, peaks, slopes),
         flux,
         np.sqrt(variance * np.count_nonzero(near)),
         numbers[:, 3] / np.sqrt(variance * inverse[:, 3, 3]),
         explained / np.maximum(explained + (residual[:, near] ** 2).sum(axis=1), 1e-300),
         width_px * np.sqrt(2 * white * inverse[:, 3, 3]) / height,
     )
+
+
+def _leaning(
+    residual: NDArray[np.float64], offsets: NDArray[np.complex128], spot: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return by how much planes lean (n, 2) that were fitted as if spots were in the middles of pixels."""
+    along = np.stack([offsets.real, offsets.imag])
+    across = along * (1 - spot * (along**2 @ spot / (along**2 @ spot**2))[:, None])
+    return np.asarray(residual @ across.T / (along * across).sum(axis=1))
 
 
 def spot_width(image: NDArray[np.float64], lattice: Lattice) -> float:
@@ -271,22 +294,24 @@ def _fits(
     return np.einsum("nij,nj->ni", inverse, values @ model), inverse
 
 
-def _subpixel(band: NDArray[np.float64], peaks: NDArray[np.complex128]) -> NDArray[np.complex128]:
-    """Return the offset from the peak pixel to the maximum of a parabola through it and its neighbours."""
-    height, width = band.shape
+def _subpixel(
+    smooth: NDArray[np.float64], peaks: NDArray[np.complex128], slopes: NDArray[np.float64]
+) -> NDArray[np.complex128]:
+    """Return the offset from the peak pixel to the maximum of a parabola through it and its neighbours.
+
+    The slopes (n, 2) of a plane are taken off: haze ends at the edge of the pupil, where its mean has one.
+    """
+    height, width = smooth.shape
     x = np.clip(peaks.real.astype(np.int64), 1, width - 2)
     y = np.clip(peaks.imag.astype(np.int64), 1, height - 2)
 
-    def top(
-        before: NDArray[np.float64], here: NDArray[np.float64], after: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
-        bend = before - 2 * here + after
-        shift = 0.5 * (before - after) / np.where(bend < 0, bend, -np.inf)
+    def top(before: NDArray[np.float64], after: NDArray[np.float64], axis: int) -> NDArray[np.float64]:
+        bend = before - 2 * smooth[y, x] + after
+        shift = (0.5 * (before - after) + slopes[:, axis]) / np.where(bend < 0, bend, -np.inf)
         return np.clip(shift, -0.5, 0.5)
 
-    here = band[y, x]
-    shift_x = top(band[y, x - 1], here, band[y, x + 1])
-    return np.asarray(shift_x + 1j * top(band[y - 1, x], here, band[y + 1, x]))
+    shift_x = top(smooth[y, x - 1], smooth[y, x + 1], 0)
+    return np.asarray(shift_x + 1j * top(smooth[y - 1, x], smooth[y + 1, x], 1))
 
 
 def _coloured(
