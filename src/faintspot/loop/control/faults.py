@@ -253,8 +253,9 @@ def silent_subapertures(slopes: Floats, steps: Floats) -> Mask:
         _responses(-slopes[1:], steps),
         *sorted(later, key=lambda fit: -fit[2])[:1],
     ]:
-        silent |= np.abs(response) + _SURE * error < _SILENT * abs(usual)
-    return np.asarray(silent & (silent.mean() <= _MOST_ALIKE))
+        found = np.abs(response) + _SURE * error < _SILENT * abs(usual)
+        silent |= found & (found.mean() <= _MOST_ALIKE)
+    return silent
 
 
 def _responses(slopes: Floats, steps: Floats) -> tuple[Floats, Floats, float]:

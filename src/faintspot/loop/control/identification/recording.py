@@ -50,6 +50,7 @@ _REGULAR = 0.9  # least part of the gaps between exposures that are whole number
 _NAMED = 5  # sub-apertures in a remark
 _BROKEN = 1e6  # rms of a slope relative to the median one
 _LARGEST = 1e30  # whose square is a number
+_RCOND = 0.05  # of the shape that slopes show
 _PARTS, _NOT_ZERO = 16, 3.0  # of a recording; rms of the means of slopes that are not 0, in standard errors
 _HELD, _HELD_MODES = 10.0, 0.1  # standard errors of the mean of a mode that is held; part of all modes
 
@@ -246,7 +247,12 @@ def prepared(recording: Recording) -> Prepared:
     if not float(np.ptp(slopes)) > 1e-12 * float(np.abs(slopes).max()):
         raise InputError(f"{recording.name}: expected slopes that vary, got constant ones")
     _check_alike(recording)
-    centred, reference, flat = _about_offsets(_without_unmeasured(recording))
+    return _in_one_convention(_without_unmeasured(recording))
+
+
+def _in_one_convention(recording: Recording) -> Prepared:
+    """Return what is prepared of slopes that measure something; silent sub-apertures are left out."""
+    centred, reference, flat = _about_offsets(recording)
     scaled = centred.scaled(float(np.nanstd(centred.slopes)))
     offsets = recording.unit * reference, flat
     moves = scaled.commands is not None and np.ptp(scaled.commands, axis=0).any()
@@ -257,8 +263,10 @@ def prepared(recording: Recording) -> Prepared:
     if recording.commands is None or recording.interaction_matrix is None:
         return Prepared(scaled, 1.0, 0, math.inf, *offsets)
     loop, sign, sent, loop_gain = _with_convention(scaled)
-    ready = _without_still_actuators(_without_silent_subapertures(loop))
-    return Prepared(ready, sign, sent, loop_gain, *offsets)
+    silent = _silent(loop)
+    if silent.any():
+        return _in_one_convention(_without_silent(recording, silent, sign))
+    return Prepared(_without_still_actuators(loop), sign, sent, loop_gain, *offsets)
 
 
 def _about_offsets(recording: Recording) -> tuple[Recording, Floats, Floats]:
@@ -421,20 +429,34 @@ def _without_still_actuators(loop: Recording) -> Recording:
     return replace(loop, interaction_matrix=matrix, remarks=(*loop.remarks, remark))
 
 
-def _without_silent_subapertures(loop: Recording) -> Recording:
-    """Return a recording without the sub-apertures whose slopes the commands do not answer, with a remark."""
+def _silent(loop: Recording) -> NDArray[np.bool_]:
+    """Return the sub-apertures that do not see the wavefront, (n,)."""
     if loop.cells is None:
-        return loop
+        return np.zeros(0, np.bool_)
     steps = np.diff(loop.commands, axis=0) @ loop.interaction_matrix.T
     steps[np.diff(loop.frame) != 1] = 0.0
-    silent = silent_subapertures(loop.slopes, steps)
-    if not silent.any():
-        return loop
+    return silent_subapertures(loop.slopes, steps)
+
+
+def _without_silent(loop: Recording, silent: NDArray[np.bool_], sign: float) -> Recording:
+    """Return a recording without silent sub-apertures, about what the mirror holds without them.
+
+    Their mean slopes have driven the mirror to a wrong shape, which the means of the others show.
+    """
     slopes = np.where(np.tile(silent, 2), np.nan, loop.slopes)
-    remark = (
-        f"{_named(silent, loop.cells)}: slopes do not answer the mirror, or are no part of what it corrects"
+    named = _named(silent, loop.cells)
+    remark = f"{named}: slopes do not answer the mirror, or are no part of what it corrects"
+    rest = replace(loop, slopes=slopes, remarks=(*loop.remarks, remark))
+    if loop.reference_slopes is not None or not _reference(loop).any():
+        return rest
+    known = np.isfinite(slopes).any(axis=0)
+    wrong = sign * np.linalg.lstsq(loop.interaction_matrix[known], _mean(slopes)[0][known], rcond=_RCOND)[0]
+    flat = (
+        _flat(replace(loop, commands=loop.commands - wrong))
+        if loop.flat_command is None
+        else loop.flat_command
     )
-    return replace(loop, slopes=slopes, remarks=(*loop.remarks, remark))
+    return replace(rest, reference_slopes=np.zeros(slopes.shape[1]), flat_command=flat)
 
 
 def _named(mask: NDArray[np.bool_], cells: NDArray[np.int64]) -> str:
