@@ -1,5 +1,6 @@
 """Learning beside an engine: what is better is handed over, and the loop goes on whatever happens to it."""
 
+import threading
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -155,7 +156,8 @@ def test_a_better_filter_is_handed_to_the_engine(
         BackgroundLearning(name, path, 1.0)
     save_control(path, controller="kalman")
     run = Run(name, outdated(model))
-    engine: Any = SimpleNamespace(loop=run.loop, learning=None, estimators=None)
+    estimators = SimpleNamespace(changing=threading.Lock())
+    engine: Any = SimpleNamespace(loop=run.loop, learning=None, estimators=estimators)
     handlers = {
         "learnt": commands_of(engine)["learnt"],
         "get": lambda _: {"settings": {"estimator": "window"}},
