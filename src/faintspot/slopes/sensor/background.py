@@ -61,13 +61,14 @@ def lenslet_background(
     finite = np.isfinite(frame)
     level = float(np.median(frame[lit & finite])) if (lit & finite).any() else 0.0
     values = scipy.ndimage.median_filter(np.where(finite, frame, level), 3)  # of hot pixels
-    if overlap(pitch_px, spot_px):
-        spot_px = _overlapping(values, lit, at, spot_px)[0]
+    overlaps = overlap(pitch_px, spot_px)
+    if overlaps and not overlap(pitch_px, narrow := _overlapping(values, lit, at, spot_px)[0]):
+        spot_px, overlaps = narrow, False
     usable = lit & finite & (away_px > min(max(_COVERED * spot_px, 2.0), _MOST_COVERED * pitch_px))
     smooth = _Planes(usable, max(_SMOOTHED * pitch_px, _LEAST_SMOOTHED_PX))
     taken, found, own = np.zeros((3, *frame.shape))
-    for _ in range(_ROUNDS):
-        if overlap(pitch_px, spot_px):
+    for number in range(_ROUNDS):
+        if overlaps and number > 0:
             taken = _overlapping(values - found - own, lit, at, spot_px)[1]
         found = smooth(values - taken - own)
         own = _of_lenslets(frame - taken - found, usable, cell, len(spots))

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from benchmarks.layouts import verdict
-from benchmarks.simulated_arrays import plain_small, random_array
+from benchmarks.simulated_arrays import aberrated_array, plain_small, random_array
 from numpy.typing import NDArray
 from tests.slopes.sensor.sensor_cases import spot_frame
 
@@ -52,6 +52,17 @@ def test_a_few_spots_anywhere_are_no_lattice(seed: int) -> None:
 @pytest.mark.parametrize("index", range(6))
 def test_random_arrays_are_right_or_doubtful(index: int) -> None:
     assert verdict(random_array(99, index))[0] != "WRONG"
+
+
+@pytest.mark.parametrize(("seed", "index"), [(1, 35), (2, 10), (2, 62), (2, 113), (3, 38), (4, 129)])
+def test_smooth_aberrations_of_few_lenslets_are_doubtful(seed: int, index: int) -> None:
+    """Displacements of up to half a pitch, whose pitch or number of lenslets was wrong without a doubt."""
+    assert verdict(aberrated_array(seed, index))[0] == "doubted"
+
+
+@pytest.mark.parametrize("index", range(4, 8))
+def test_most_aberrated_arrays_are_right(index: int) -> None:
+    assert verdict(aberrated_array(5, index))[0] == "right"
 
 
 @pytest.mark.parametrize(("bend", "doubtful"), [(0.02, False), (0.5, True)])

@@ -26,10 +26,12 @@ from faintspot.slopes.sensor.detection.nodes import (
     no_drift,
     spot_width,
 )
-from faintspot.slopes.sensor.region import PupilRegion, as_rows, as_tree, neighbour_vectors
+from faintspot.slopes.sensor.region import PupilRegion, as_rows, as_tree, links_of, neighbour_vectors
 
 _FIT_PASSES = 10
-_REFITS = 3  # at most, without a background that varies
+# Refits, at most, without a background that ends at the edge of the pupil, and the quantiles between which
+# that of dark lenslets spreads.
+_REFITS, _DARK_SPREAD = 3, (0.1, 0.9)
 # A spot with this signal-to-noise ratio that is as bright as those of illuminated lenslets and this far
 # (pitches) from all of them belongs to another lenslet: a smooth aberration brings no two spots closer.
 _CLEAR, _ELSEWHERE = 6.0, 0.4
@@ -45,11 +47,13 @@ _BETWEEN, _CUT = 0.45, 0.5
 _EXPLAINED, _SUFFICIENT, _CERTAIN, _LITTLE = 0.8, 0.6, 0.85, 0.4
 # Median distance of the spots from their nodes (pitches) above which a fit to them makes a lattice worse.
 _LOOSE = 0.18
-# Bright spots at no node, at least so many and this part of the lenslets, that also raise a doubt.
-_SPARE, _SPARE_PART = 3, 0.02
-# Relative standard error of the pitch from which it is doubtful, and from which it is if a spot lies this far
-# (pitches) from its node: jitter of 0.08 pitch in 4 x 4 lenslets stays below.
-_LARGEST_ERROR, _ERROR, _DISPLACED = 0.03, 0.015, 0.32
+# Bright spots at no node, at least so many and this part of the lenslets, that also raise a doubt; one does
+# among so few lenslets.
+_SPARE, _SPARE_PART, _FEW = 3, 0.02, 40
+# Relative standard error of the pitch from which it is doubtful: jitter of 0.08 pitch in 4 x 4 lenslets stays
+# below. That error takes displacements for independent, which those of a smooth aberration are not: the other
+# limit is that of neighbours with such a correlation.
+_LARGEST_ERROR, _ERROR, _ALIKE = 0.03, 0.012, 0.3
 # Fewest lit lenslets, and fewest pairs of neighbouring spots in each direction: one pair is a coincidence.
 FEWEST, _PAIRS = 4, 1.4
 
@@ -95,14 +99,21 @@ class LatticeFit:
         return far, int(sizes.sum() - sizes.max(initial=0))
 
     @property
-    def displacements(self) -> tuple[float, float]:
-        """Largest distance of a spot from its node, and standard error of the pitch, in pitches."""
+    def displacements(self) -> tuple[float, float, float]:
+        """Largest distance of a spot from its node, and standard error of the pitch, in pitches.
+
+        The last number is the correlation of neighbours: 0 of jitter, up to 1 of a smooth aberration.
+        """
         lit = self.illuminated.nodes
-        nodes = self.lattice.positions(self.spots.cells)[lit]
+        cells = self.spots.cells[lit]
+        nodes = self.lattice.positions(cells)
         off = self.spots.positions[lit] - nodes
         off -= off.mean()
         error = np.linalg.norm(off) / np.linalg.norm(nodes - nodes.mean()) / np.sqrt(max(len(off) - 2, 1))
-        return float(np.abs(off).max()) / self.lattice.pitch_px, float(error)
+        one, other = off[links_of(self.lattice.neighbours(cells)).T]
+        squares = float(np.sum(np.abs(one) ** 2 + np.abs(other) ** 2))
+        alike = 2 * float(np.vdot(one, other).real) / max(squares, 1e-300)
+        return float(np.abs(off).max()) / self.lattice.pitch_px, float(error), alike
 
     @property
     def explained(self) -> float:
@@ -136,8 +147,8 @@ def best_fit(
             best, highest = fit, rank
     if best is None:
         return None
-    for _ in range(_REFITS):
-        if (even := _without_background(image, best)) is None:
+    for number in range(_REFITS):
+        if (even := _without_background(image, best, in_steps=number == 0)) is None:
             break
         fit = _fitted(even, best.lattice, illuminated_fraction, pupil)
         if fit.lit < FEWEST:
@@ -153,10 +164,14 @@ def best_fit(
     )
 
 
-def _without_background(image: NDArray[np.float64], fit: LatticeFit) -> NDArray[np.float64] | None:
+def _without_background(
+    image: NDArray[np.float64], fit: LatticeFit, *, in_steps: bool
+) -> NDArray[np.float64] | None:
     """Return an image without its background if that ends with the lit lenslets, otherwise None.
 
-    Sky that is seen through lit lenslets only looks like the side of a spot at the edge of the pupil.
+    Sky that is seen through lit lenslets only looks like the side of a spot at the edge of the pupil. It ends
+    there if dark lenslets have more of the same background than of that of lit ones: haze goes on. Taking off
+    the median of each cell, in steps, does not need to know the spots.
     """
     lattice, lit = fit.lattice, fit.illuminated.nodes
     at = lattice.positions(fit.spots.cells) + fit.spots.drifts
@@ -169,13 +184,20 @@ def _without_background(image: NDArray[np.float64], fit: LatticeFit) -> NDArray[
 
     def ends(levels: NDArray[np.float64]) -> bool:
         steps = levels[:, None] - np.append(levels, np.nan)[beside]
-        return bool(np.median(steps[at_edge]) > least)
+        spread = float(np.ptp(np.quantile(levels[~lit], _DARK_SPREAD)))
+        return bool(np.median(steps[at_edge]) > max(least, spread))
 
-    if not ends(levels_between(image, lattice, at)):
+    levels = levels_between(image, lattice, at)
+    if not ends(levels):
         return None
     around = neighbour_vectors(lattice.geometry, lattice.pitch_px, lattice.angle_deg)
     background = lenslet_background(image, at[lit], around, lattice.pitch_px, fit.width_px)
-    return image - background if ends(values_at(background, at)) else None
+    if not ends(values_at(background, at)):
+        return None
+    if in_steps:
+        y, x = np.indices(image.shape)
+        background = levels[as_tree(at).query(np.stack([x, y], axis=-1))[1]]
+    return image - background
 
 
 def _fitted(
@@ -222,9 +244,9 @@ def _unclear(fit: LatticeFit) -> str:
         return ""
     elsewhere, dark = fit.unexplained
     count = fit.lit
-    if fit.explained > _CERTAIN and elsewhere < max(_SPARE, _SPARE_PART * count):
-        largest, error = fit.displacements
-        if error < (_ERROR if largest > _DISPLACED else _LARGEST_ERROR):
+    if fit.explained > _CERTAIN and elsewhere < (1 if count < _FEW else max(_SPARE, _SPARE_PART * count)):
+        largest, error, alike = fit.displacements
+        if error < (_ERROR if alike > _ALIKE else _LARGEST_ERROR):
             return ""
         return (
             f"spots lie up to {largest:.2f} of the pitch from the lattice, and {count} lit lenslets tell its "
