@@ -301,14 +301,14 @@ class TestUse:
 @pytest.mark.slow
 @needs_compiler
 class TestMemory:
-    LINK = "-Wl,--wrap=malloc,--wrap=calloc,--wrap=aligned_alloc"
+    LINK = ("-Wl,--wrap=malloc,--wrap=calloc,--wrap=aligned_alloc", "-lm")
 
     def built(self, folder: Path, library: ExportedLibrary, *flags: str) -> Path:
         """The harness with the runtime and the kernels in it."""
         source, objects = library.bundle.parent, sorted((library.bundle.parent / "kernels").glob("*.o"))
         harness = Path(__file__).parent / "library_harness.c"
         compiler = ["cc", "-g", "-O1", "-Wall", *flags, f"-I{source}", "-o", folder / "harness"]
-        run(*compiler, harness, source / "faintspot.c", *objects, self.LINK)
+        run(*compiler, harness, source / "faintspot.c", *objects, *self.LINK)
         return folder / "harness"
 
     @pytest.mark.parametrize("kind", ["uint16", "float32", "images"])

@@ -29,13 +29,13 @@ from tests.refusals import refused_in_one_line
 
 import faintspot as fs
 from faintspot.base.tables import PRESETS
-from faintspot.engine import frame_path
 from faintspot.engine.frame_path import FramePath, Progress
 from faintspot.slopes.estimators import estimators
 from faintspot.slopes.estimators.centroid import brightest_pixels
 from faintspot.slopes.kernels import parallel
 from faintspot.slopes.kernels.groups import STAGE_ROWS, SlopeArrays, new_scratch
 from faintspot.slopes.kernels.host import WIDTHS
+from faintspot.slopes.pipeline import slope_pipeline
 from faintspot.slopes.pipeline.plan import kernel_frames
 from faintspot.slopes.pipeline.slopes import RESULT_TYPES, Slopes, prior_slopes
 from faintspot.slopes.spots.psf import PSF
@@ -228,7 +228,7 @@ def _guarded_scratch(at_end: bool) -> Iterator[None]:
         return guarded_tree(new_scratch(*arguments), at_end)
 
     known = vars(parallel._local)  # what this thread has made already
-    with mock.patch.object(parallel, "new_scratch", make), mock.patch.object(frame_path, "new_scratch", make):
+    with mock.patch.object(parallel, "new_scratch", make), mock.patch.object(slope_pipeline, "new_scratch", make):
         known.pop("known", None)
         yield
         known.pop("known", None)
