@@ -42,7 +42,7 @@ from faintspot.slopes.recorded.first_layout import (
 from faintspot.slopes.recorded.first_settings import FirstSettings
 from faintspot.slopes.sensor.found_layout import FoundLayout
 from faintspot.slopes.sensor.layout import GEOMETRIES, LARGEST_BIN, OPTICS, Layout
-from faintspot.slopes.sensor.window_checks import LARGEST_WINDOW, reference_in_words
+from faintspot.slopes.sensor.window_checks import LARGEST_WINDOW, removed_terms
 
 _array = partial(option, section="Lenslet array")
 _windows = partial(option, section="Windows")
@@ -326,7 +326,11 @@ def _left_out(found: FoundLayout, layout: Layout) -> list[str]:
             "the reference"
         )
     if layout.fitted:
-        lines.append(reference_in_words(layout.fitted))
+        lines.append(
+            "the reference is the lattice fitted to this frame: slopes lack its "
+            f"{removed_terms(layout.fitted)}; --pitch-px, --angle-deg, --centre here, or slopes --reference "
+            "flat.npz, keep them"
+        )
     moved = np.abs(np.median(layout.offsets, axis=0))
     if moved.max() > layout.bin:
         lines.append(

@@ -184,3 +184,14 @@ def test_order_of_bytes(peak: int, offset: int, std_px: float) -> None:
     assert misread(right.view(np.uint8))
     if np.ptp(right >> 8):  # else its bytes swapped are the same picture, 256 times as bright
         assert misread(right.byteswap())
+
+
+def test_values_below_zero_that_wrapped_around_are_refused() -> None:
+    """A dark subtracted in unsigned integers; saturated pixels beside dark ones are no sign of it."""
+    rng = np.random.default_rng(3)
+    light = rng.normal(0.0, 3.0, (40, 40))
+    light[::8, ::8] += 500.0
+    assert misread(light.round().astype(np.int32).astype(np.uint16))
+    assert misread(light.round().astype(np.int32).astype(np.uint16).astype(np.float32))
+    saturated = np.where(light > 400, 65535, np.abs(light)).astype(np.uint16)
+    assert not misread(saturated)

@@ -305,7 +305,13 @@ def read_map(key: str, location: str | Path) -> NDArray[Any]:
     array = read_array(location)
     if array.ndim == 2 and array.shape[1] == 2:
         return array
-    return np.asarray((array != 0) | ~np.isfinite(array))
+    bad = np.asarray((array != 0) | ~np.isfinite(array))
+    if 2 * np.count_nonzero(bad) > bad.size and len(np.unique(array)) > 2:
+        raise InputError(
+            f"{location}: expected a map that is 0 in good pixels, {np.mean(bad):.0%} are not, with many "
+            "values as in an image"
+        )
+    return bad
 
 
 def _map_or_value(path: Path, key: str, value: object) -> object:

@@ -136,14 +136,23 @@ class LargestValues:
 # bytes read one by one: low and high bytes alternate, and every second is alike.
 _SMOOTHER, _ALTERNATE, _ALIKE = 0.2, -0.2, 0.5
 _CENTRAL, _FEW = (0.005, 0.995), 8  # pixels that count; range of the high bytes over that of the low ones
+# Noise about 0 that wraps around: part of the range between neighbours, and part of the neighbours.
+_WRAPPED, _OFTEN = 0.75, 0.02
 
 
-def misread(frame: NDArray[np.generic]) -> str:
-    """Return why the bytes of a frame (h, w) of integers are probably read wrong; empty if they are not.
+def misread(frame: NDArray[Any]) -> str:
+    """Return why the numbers of a frame (h, w) are probably not those of the camera; empty if they are.
 
     Neighbouring pixels of a camera are alike. Those of another order of bytes are not, or only their high
-    bytes vary much.
+    bytes vary much. Neighbours near 0 and near the limit of unsigned numbers are noise below and above 0.
     """
+    limit = int(np.iinfo(frame.dtype).max) if frame.dtype.kind == "u" else 65535
+    numbers = np.where(frame < limit, frame, np.nan)  # pixels at the limit may be saturated
+    if np.mean(np.abs(np.diff(numbers, axis=1)) > _WRAPPED * limit) > _OFTEN and np.nanmin(numbers) >= 0:
+        return (
+            f"many pixels near {limit} are beside others near 0, as where a dark was subtracted in unsigned "
+            "integers and values below 0 wrapped around; subtract it in signed ones, or give it with --dark"
+        )
     if frame.dtype.kind not in "iu" or min(frame.shape) < 3:
         return ""
     if frame.dtype.itemsize == 1:

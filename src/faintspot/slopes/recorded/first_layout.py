@@ -204,7 +204,7 @@ def first_layout(
         result.add_gain(seen)
         seen = first_settings(layout, result.calibration, first)
     if (dark := given.get("dark")) is not None and not is_number(dark):
-        result.add_darks(dark, keeps_noise=given.get("read_noise_e") is not None)
+        result.add_darks(dark, "e-" if is_known else "ADU", keeps_noise=given.get("read_noise_e") is not None)
     if isinstance(found, FoundLayout) and not seen.flux > 0:
         raise InputError(
             f"{source.description}: expected spots, found none in the {len(layout)} windows of the layout; "
@@ -373,7 +373,7 @@ class _Completed:
             low, high = (plain(float(end)) for end in np.quantile(dark, [0.02, 0.98]))
             text = f"{low} to {high} ADU: the background varies, as reflections and haze do"
             if calibration.dark is not None:
-                self.note(f"{text}, beyond the dark, and is not taken off; without a dark it is")
+                self.note(f"{text}; only the dark that is given is subtracted, and slopes contain the rest")
             else:
                 self.estimate(f"dark is a map, {text}; --dark gives the camera's own", dark=dark)
         elif calibration.dark is None and level > spread > 0:
@@ -388,7 +388,7 @@ class _Completed:
         text = f"gain: 1 would leave {plain(seen.flux)} electrons of a spot; {likely:g} is assumed"
         self.estimate(text, gain_e_per_adu=likely)
 
-    def add_darks(self, location: str, *, keeps_noise: bool) -> None:
+    def add_darks(self, location: str, unit: str, *, keeps_noise: bool) -> None:
         """Add noise and bad pixels of a file of dark frames; not of few frames, or of frames with NaN."""
         with open_frames([location]) as frames:
             count = min(frames.n_frames, _MOST_NUMBERS // (frames.shape[0] * frames.shape[1]))
@@ -403,7 +403,7 @@ class _Completed:
             noise = pixels.noise_adu * electrons_per_adu * calibration.em_gain
             calibration = replace(calibration, read_noise_e=noise)
             rms, median = calibration.typical_read_noise_e, float(np.nanmedian(calibration.read_noise_e))
-            self.note(f"read noise of each pixel from the darks: median {median:.3g} e-, rms {rms:.3g} e-")
+            self.note(f"read noise of each pixel from the darks: median {median:.3g}, rms {rms:.3g} {unit}")
         bad = np.concatenate([pixels.blinking, pixels.hot])
         if len(bad):
             calibration = calibration.with_bad_pixels(bad)

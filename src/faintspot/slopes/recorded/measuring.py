@@ -32,7 +32,6 @@ from faintspot.slopes.pipeline.slope_pipeline import SlopePipeline
 from faintspot.slopes.pipeline.slopes import Slopes, layout_coordinates
 from faintspot.slopes.recorded.survey import Survey, configured, frames_apart, response, stretches, survey
 from faintspot.slopes.sensor.layout import Layout
-from faintspot.slopes.sensor.window_checks import reference_in_words
 
 if TYPE_CHECKING:
     from faintspot.io.slopes_writer import SlopeWriter
@@ -240,7 +239,7 @@ def _pipeline(
         about_reference = positions is not None and error.name == "reference"
         is_file = about_reference and isinstance(reference, str | Path)
         raise error.within(reference if is_file else described.path) from None
-    return pipeline, [*notes, "" if positions is not None else reference_in_words(layout.fitted)]
+    return pipeline, notes
 
 
 def _measuring(pipeline: SlopePipeline, seen: Survey, *, follow: bool) -> SlopePipeline | SpotFollower:

@@ -41,12 +41,15 @@ class SlopesRun:
         Frame of the pictures, or why there is none; "" leaves it out.
     truth : array (n_frames, n_subapertures, 2), optional
         True x, y, px from each sub-aperture's centre. Then no wavefront is fitted.
+    unit : str
+        Unit of the flux: "ADU" where the camera's gain is unknown.
     """
 
     methods: Sequence[MeasuredSlopes]
     layout: Layout | None
     shown: pictures.Example | pictures.Followed | str = ""
     truth: Floats | None = None
+    unit: str = "e-"
 
     @cached_property
     def same_frames(self) -> bool:
@@ -213,6 +216,7 @@ def method_numbers(run: SlopesRun, index: int) -> dict[str, object]:
         "jitter": median(run.jitters[index]),
         "valid": float(method.valid.mean()),
         "flux": method.median_flux_e,
+        "unit": run.unit,
     }
 
 
@@ -236,7 +240,7 @@ def _flux(run: SlopesRun) -> Section:
     table = _TEXT.table("flux.flags", rows, [*(method.name for method in run.methods), "meaning"])
     if run.layout is None:
         return _TEXT.section("flux", table, missing=NO_LAYOUT)
-    return _TEXT.section("flux", table, pictures.maps_figure(run.methods, run.jitters, run.layout))
+    return _TEXT.section("flux", table, pictures.maps_figure(run.methods, run.jitters, run.layout, run.unit))
 
 
 def _slopes(run: SlopesRun) -> Section:

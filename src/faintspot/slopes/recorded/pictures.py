@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import binary_closing
 
 from faintspot.base.report import plots
 from faintspot.base.report.page import FigureWithData
@@ -23,7 +24,7 @@ Floats = NDArray[np.float64]
 _TEXT = Texts("faintspot.slopes.recorded")
 _MOST_MARKED = 150  # sub-apertures of the whole sensor's picture: of more, marks would hide the spots
 _MARKS = (("+", "white"), ("x", "#D55E00"), ("1", "#E69F00"), ("2", "#CC79A7"))  # with a black outline
-_ON_DARK = {"facecolor": "#777777", "labelcolor": "white", "edgecolor": "none", "frameon": True}
+_ON_DARK = {"facecolor": "#333333", "labelcolor": "white", "edgecolor": "none", "frameon": True}
 _ABOVE: dict[str, Any] = {"legend": "outside upper center", **_ON_DARK}
 _PATH, _VALID, _INVALID = "#56B4E9", "#E69F00", "#CC79A7"
 _MOST_FRAMES = 200  # of which the paths of followed spots are drawn
@@ -47,6 +48,8 @@ class Example:
         True x, y, px.
     steps : sequence of Step
         What is shown of them; "raw" first.
+    unit : str
+        Unit of the calibrated images.
     """
 
     layout: Layout
@@ -54,6 +57,7 @@ class Example:
     number: int = 0
     truth: Floats | None = None
     steps: Sequence[Step] = TotalVariation.steps_shown
+    unit: str = "e-"
 
     @property
     def first(self) -> Stages:
@@ -81,13 +85,17 @@ def sensor_figure(example: Example) -> FigureWithData:
     """Draw all windows of the calibrated frame at their places, with the positions of the spots."""
     layout, images = example.layout, example.first.calibrated
     sheet, start = assembled(layout, images), layout.corners.min(axis=0) - 0.5
+    # Gaps of a pixel between windows, where the pitch is not a whole number, are no lines.
+    closed = binary_closing(np.pad(np.isfinite(sheet), 1, mode="edge"), np.ones((3, 3)))[1:-1, 1:-1]
+    sheet[closed & np.isnan(sheet)] = np.nanmedian(images)
     (low, high), (n_rows, n_columns) = plots.limits_of(images, percent=99.8), sheet.shape
     extent = start[1], start[1] + n_columns, start[0], start[0] + n_rows
     middles = layout.corners[:, ::-1] + 0.5 * (np.array(layout.window[::-1]) - 1)
     few = len(layout) <= _MOST_MARKED
     marks = _crosses({name: xy + middles for name, xy in example.positions().items()}, 6) if few else []
     style = {"vmin": low, "vmax": high, "extent": extent}
-    picture, width = plots.Picture(sheet, "e- per pixel", style=style, marks=marks), 0.62 * plots.WIDTH
+    picture = plots.Picture(sheet, f"{example.unit} per pixel", style=style, marks=marks)
+    width = 0.62 * plots.WIDTH
     values = {
         "frame": example.number,
         "marked": few,
@@ -106,12 +114,12 @@ def steps_figure(example: Example) -> FigureWithData:
     for which, index in chosen.items():
         limits = plots.limits_of(stages.calibrated[index], percent=99.8)
         crosses = _crosses({name: xy[index : index + 1] for name, xy in positions.items()}, 13)
-        y = f"{which}\nno. {index}, {plain_number(float(stages.slopes.flux[index]))} e-\ny (px)"
+        y = f"{which}\nno. {index}, {plain_number(float(stages.slopes.flux[index]))} {example.unit}\ny (px)"
         row = list[plots.Picture]()
         for title, step in steps.items():
             image, is_raw = getattr(stages, step)[index], step == "raw"
             low, high = plots.limits_of(image, percent=99.8) if is_raw else limits
-            unit = "ADU" if is_raw else "e- per pixel" if title == list(steps)[-1] else ""
+            unit = "ADU" if is_raw else f"{example.unit} per pixel" if title == list(steps)[-1] else ""
             options = {**style, "vmin": low, "vmax": high}
             above, marks = "" if rows else title, [] if is_raw else crosses
             row.append(plots.Picture(image, unit, above, "x (px)", "" if row else y, options, marks))
@@ -237,7 +245,7 @@ def followed_figure(followed: Followed) -> FigureWithData:
 
 
 def maps_figure(
-    methods: Sequence[MeasuredSlopes], jitters: Sequence[Floats], layout: Layout
+    methods: Sequence[MeasuredSlopes], jitters: Sequence[Floats], layout: Layout, unit: str = "e-"
 ) -> FigureWithData:
     """Draw flux, valid frames and jitter, a row of maps for each method; of one frame, flux only."""
     several = methods[0].n_frames > 1
@@ -246,7 +254,7 @@ def maps_figure(
     rows = []
     for method, jitter_px in zip(methods, jitters, strict=True):
         name = f"{method.name}: {'median ' if several else ''}flux"
-        row = [Map(layout, method.flux_e, "flux (e-)", name, flux_limits)]
+        row = [Map(layout, method.flux_e, f"flux ({unit})", name, flux_limits)]
         if several:
             percent = 100.0 * method.valid_frames / method.n_frames
             row.append(Map(layout, percent, "valid frames (%)", "valid frames", (0, 100)))

@@ -59,7 +59,7 @@ def report_of_stored(paths: Sequence[str | Path], *, frames: Sequence[str | Path
         _check_same_sensor(first, store)
     methods, notes = _methods(stores)
     return slopes_report(
-        SlopesRun(methods, first.layout, _shown(stores, methods, frames, notes)),
+        SlopesRun(methods, first.layout, _shown(stores, methods, frames, notes), unit=first.flux_unit),
         title=f"Slopes of {' and '.join(store.path.name for store in stores)}",
         facts=_facts(stores, methods),
         configurations=_configurations(stores, methods),
@@ -154,7 +154,7 @@ def _example(
     estimator = not_none(stores[0].estimator)
     if len(stores) == 1 and (without := estimator.without_denoising()) is not None:
         stages[without.label] = stores[0].pipeline(without).explain(frame)
-    return Example(layout, stages, number, steps=estimator.steps_shown)
+    return Example(layout, stages, number, steps=estimator.steps_shown, unit=stores[0].flux_unit)
 
 
 def _followed(

@@ -20,7 +20,7 @@ from faintspot.slopes.estimators.base import Estimator
 from faintspot.slopes.pipeline import configuration
 from faintspot.slopes.pipeline.settings import Settings
 from faintspot.slopes.sensor.layout import Layout
-from faintspot.slopes.sensor.window_checks import reference_in_words
+from faintspot.slopes.sensor.window_checks import removed_terms
 from faintspot.slopes.spots.fixed_weights import FixedWeights
 from faintspot.slopes.spots.psf import PSF
 
@@ -42,6 +42,8 @@ class StoredRun:
     spot: dict[str, Any] = field(default_factory=dict)
     """PSF and score, as for `SlopePipeline`; None where there are none."""
     laser: LaserSpots | None = None
+    flux_unit: str = "e-"
+    """Unit of the flux: "ADU" where the configuration states no gain of the camera."""
     lost: list[str] = field(default_factory=list)
     """Optional parts of a pipeline: a PSF or a score, whose file may be missing."""
 
@@ -50,8 +52,8 @@ class StoredRun:
         """Note about the terms that its slopes lack, as their reference was fitted to a frame."""
         if self.layout is None or not self.layout.fitted or "reference" in self.stored.attributes:
             return ""
-        text = reference_in_words(self.layout.fitted)
-        return f"{text[0].upper()}{text[1:]}."
+        terms = removed_terms(self.layout.fitted)
+        return f"The {terms} of the layout's frame are in the reference, not in these slopes."
 
     @property
     def estimator(self) -> Estimator | None:
@@ -142,6 +144,7 @@ def _rebuild(store: StoredRun, layout_only: bool) -> None:
         return
     store.settings = stored.settings
     table = stored.tables.get("calibration", {})
+    store.flux_unit = "e-" if "gain_e_per_adu" in table else "ADU"
     if any(map(_is_map, table.values())):
         store.calibration = _original_calibration(store, table)
     else:

@@ -191,16 +191,7 @@ def _half_node(place: complex, across_deg: float) -> complex:
     return complex(column + row * direction)
 
 
-def reference_in_words(fitted: Sequence[str]) -> str:
-    """Return which terms of the wavefront slopes lack whose reference was fitted, and how to keep them.
-
-    Empty if nothing was fitted.
-    """
-    if not fitted:
-        return ""
-    terms = [_REMOVED[name] for name in fitted]
-    words = " and ".join([", ".join(terms[:-1]), terms[-1]] if len(terms) > 1 else terms)
-    return (
-        f"the reference is the lattice fitted to the layout's frame: slopes lack that frame's {words}; "
-        "faintspot layout with --pitch-px, --angle-deg, --centre, or --reference flat.npz, keeps them"
-    )
+def removed_terms(fitted: Sequence[str]) -> str:
+    """Return which terms of the wavefront slopes lack whose lattice was fitted to a frame, in words."""
+    *terms, last = (_REMOVED[name] for name in fitted)
+    return f"{', '.join(terms)} and {last}" if terms else last

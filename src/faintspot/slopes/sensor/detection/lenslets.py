@@ -230,7 +230,9 @@ def _mean_image(frames: NDArray[Any], bad: NDArray[np.bool_]) -> NDArray[np.floa
     if min(frames.shape[-2:]) < 2 * SMALLEST_PITCH_PX:
         raise InputError(f"frame: expected at least 10 x 10 pixels, got shape {frames.shape}")
     if bad.mean() > 0.5:
-        raise InputError(f"bad_pixels: {bad.sum()} of {bad.size} pixels are bad, expected at most half")
+        raise InputError(
+            f"bad_pixels: {bad.sum()} of {bad.size} pixels are bad, expected at most half; good ones are 0"
+        )
     if bad.any():
         frames = np.where(bad, np.median(frames[..., ~bad]).astype(frames.dtype), frames)
     return _robust_mean(finite_array("frame", frames))
