@@ -109,11 +109,12 @@ def command(
     # A difference of positions in the frame lacks nothing.
     notes = [note for note in run.notes if minus is None or note != run.about_reference]
     measured, other = Slopes.from_variables(run.stored.variables, keep=run.keep), None
-    if minus is None:
-        other = _reference(run, notes)
-    else:
+    if minus is not None:
         measured, other, about = difference(run, open_run(Path(minus)))
         notes += about
+    elif (reference := _reference(run, notes)) is not None:
+        # Slopes of sub-apertures that have no valid reference are not relative to it.
+        measured, other = replace(measured, flags=reference[0].flags), reference[1]
     with errors_of_options(slopes):
         wavefront = fit_wavefront(measured, layout, modes=modes)
     if other is not None:
@@ -146,16 +147,18 @@ def command(
         _write_flattening(flat, target, measured, wavefront, layout)
 
 
-def _reference(run: StoredRun, notes: list[str]) -> Slopes | None:
-    """Return the slopes of the recording that was the reference; add a note if it is taken as exact."""
+def _reference(run: StoredRun, notes: list[str]) -> tuple[Slopes, Slopes] | None:
+    """Return the slopes with the flags of their reference, and its own; add notes, also if it is exact."""
     file = str(run.stored.attributes.get("reference_file", ""))
     if not file:
         return None
     try:
-        return difference(run, open_run(Path(file)))[1]
+        measured, other, about = difference(run, open_run(Path(file)))
     except InputError as error:
         notes.append(f"The reference {file} is taken as exact: {error}.")
         return None
+    notes += about
+    return measured, other
 
 
 def _write_flattening(

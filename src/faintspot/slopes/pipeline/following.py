@@ -108,6 +108,8 @@ class SpotFollower:
         self._width_px: float | None = None
         self._expected: Complex | None = None
         self._usual = 0.0
+        self.uncertain_frames = 0
+        """Frames whose spots fit other lenslets nearly as well, so that none of their slopes is valid."""
 
     def _of_images(self) -> SlopePipeline:
         """Return the pipeline of windows that are already cut, calibrated, and centred on their spots."""
@@ -149,6 +151,7 @@ class SpotFollower:
             expected, certain = self._expected + self._common_motion(calibrated, self._expected), True
         slopes, at = self._measured(calibrated, saturated, expected)
         if not certain:
+            self.uncertain_frames += 1
             doubtful = np.where(slopes.measured, np.uint8(SubapertureFlag.UNLIKE_NEIGHBOURS), np.uint8(0))
             return replace(slopes, flags=slopes.flags | doubtful)
         if self._is_lost(slopes.valid, at, expected):

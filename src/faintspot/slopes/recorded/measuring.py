@@ -219,6 +219,11 @@ def _write(
             progress(start + len(block), source.n_frames)
     if failed := prepared.faults - faults:
         summary.notes.append(f"{failed} frames without slopes: {prepared.fault}")
+    if not isinstance(measure, SlopePipeline) and (uncertain := measure.uncertain_frames):
+        summary.notes.append(
+            f"{uncertain} frames without valid slopes: their spots fit lenslets a pitch farther nearly as "
+            "well, as of a source that lights more; make a layout from them, compare with wavefront --minus"
+        )
 
 
 def _pipeline(
