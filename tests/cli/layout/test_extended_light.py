@@ -61,7 +61,7 @@ def test_background_beyond_a_stated_dark_is_reported(folder: Path, run: Commands
     """The dark stays as stated, and the width does not follow the reflection."""
     np.save("a.npy", flat_frame(500.0).pixels)
     out = run.ok("layout", "a.npy", "-o", "new.toml", "--dark", "20").out
-    assert "beyond the dark" in out
+    assert "the background varies" in out
     known = configuration.Configuration("new.toml")
     assert known.calibration.dark == 20.0
     assert known.settings.spot_fwhm_px == pytest.approx(4.7, rel=0.15)

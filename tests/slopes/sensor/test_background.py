@@ -16,7 +16,7 @@ BESIDE = neighbour_vectors("square", PIXELS, 0.0)
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize(("fwhm_px", "flux_e"), [(3.0, 600.0), (5.5, 2000.0)])
 def test_background_of_lit_lenslets(kind: str, fwhm_px: float, flux_e: float) -> None:
-    """To 1.5 of 40 e- apart from a constant, which moves no spot; a smooth map is off by 10 at edges.
+    """To 1 of 40 e- apart from a constant, which moves no spot; a smooth map is off by 10 at edges.
 
     Spots that overlap leave a constant of up to a tenth of their background.
     """
@@ -29,7 +29,7 @@ def test_background_of_lit_lenslets(kind: str, fwhm_px: float, flux_e: float) ->
     lit = np.zeros((ACROSS, ACROSS), bool)
     lit[rows, columns] = True
     error = (found - 100 - SKY_E * sky)[np.kron(lit, np.ones((PIXELS, PIXELS), bool))]
-    assert error.std() < 1.5
+    assert error.std() < 1.0
     assert abs(error.mean()) < 4.0
 
 

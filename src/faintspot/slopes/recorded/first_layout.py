@@ -50,6 +50,7 @@ _MOST_FRAMES = 200  # averaged to find the spots
 _FIRST_FRAMES = 20  # measured for the settings
 _FEWEST_E = 10.0  # electrons of a spot that is seen in a single frame
 _MOST_NUMBERS = 1 << 27  # of dark frames, read at a time
+_MOST_LEVELS = (0.02, 0.98)  # quantiles between which a background varies
 _QUAD_CELL = 2  # pixels on a side
 _LEVELS = ("dark", "read_noise_e")  # numbers or maps
 
@@ -189,6 +190,7 @@ def first_layout(
     layout = replace(found.layout, **optics, doubts=found.doubts)
     result = _Completed(calibration, unused + notes)
     result.add_background(found, layout, mean)
+    layout = replace(layout, doubts=(*layout.doubts, *result.doubts))
     if len(hot):
         bad = result.calibration.with_bad_pixels(hot).bad_pixels
         result.estimate(f"{len(hot)} hot pixels masked", bad_pixels=bad)
@@ -344,6 +346,7 @@ class _Completed:
 
     calibration: Calibration
     notes: list[str]
+    doubts: tuple[str, ...] = ()
 
     def note(self, text: str) -> None:
         self.notes.append(text)
@@ -368,9 +371,12 @@ class _Completed:
             levels, background = _background(found, mean)
             if overlap(found.lenslets.pitch_px, found.lenslets.spot_px):
                 level = float(np.median(levels)) * adu_per_electron
+                height = float(np.median(found.lenslets.flux)) / (2 * np.pi * found.lenslets.spot_px**2)
+                if background is not None and np.ptp(np.quantile(levels, _MOST_LEVELS)) > height:
+                    self.doubts += ("the background under overlapping spots varies more than they are high",)
         if background is not None:
             dark = (background * adu_per_electron).astype(np.float32)
-            low, high = (plain(float(end)) for end in np.quantile(dark, [0.02, 0.98]))
+            low, high = (plain(float(end)) for end in np.quantile(dark, _MOST_LEVELS))
             text = f"{low} to {high} ADU: the background varies, as reflections and haze do"
             if calibration.dark is not None:
                 self.note(f"{text}; only the dark that is given is subtracted, and slopes contain the rest")
