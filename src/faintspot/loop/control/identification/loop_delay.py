@@ -31,12 +31,15 @@ GAINS = 0.1, 1.6
 _START_GAIN = 0.6
 _MODEL_ERROR = 0.05  # frames: spectra of real slopes differ from the theory
 _GAIN_ERROR = 0.04  # absolute and relative, likewise
-_AVERAGED = 0.4, 0.55, 0.7, 1.0, 1.4, 2.0
+_AVERAGED = 0.4, 0.7, 1.0, 1.4
 """Values of `SlopeTurbulence.averaged` of which the likeliest is used: sharper or smoother slopes."""
 _AXES_ERROR = 0.09  # of the gain of x relative to y, likewise: in loops of three packages, of equal gains
 _SURE = 3.0  # standard errors
 _SPEEDS_M_PER_S = (1.0, 3.0, 6.0, 10.0, 15.0, 22.0, 32.0)
 _DIRECTIONS = 4  # of half a turn: opposite winds have the same spectrum
+_SMOOTH = 0.015, 0.03, 0.06, 0.12
+"""Parts of the frame rate beyond which parts of the turbulence fall as a Gaussian: without fine structure it
+falls more steeply than that of von Karman, which a gain that is too small explains, too."""
 _MOST_SUBAPERTURES, _MOST_MODES = 160, 36
 """Side by side: in sparse ones structure between them is taken for large modes."""
 _UPDATES, _FEW_UPDATES, _POWER = 60, 15, 0.9
@@ -127,10 +130,8 @@ class DelayFits:
     ) -> None:
         n = len(site.positions_m)
         if n < FEWEST_SUBAPERTURES:
-            raise InputError(
-                f"recording: expected {FEWEST_SUBAPERTURES} sub-apertures or more, as vibrations hide it in "
-                f"tip and tilt, got {n}"
-            )
+            fewest = f"{FEWEST_SUBAPERTURES} sub-apertures or more, as vibrations hide it in tip and tilt"
+            raise InputError(f"recording: expected {fewest}, got {n}")
         apart = np.hypot(*(site.positions_m - site.positions_m.mean(axis=0)).T)
         kept = np.sort(np.argsort(apart, kind="stable")[:_MOST_SUBAPERTURES])
         columns = np.concatenate([kept, kept + n])
@@ -191,7 +192,11 @@ class DelayFits:
                 break
         first, last = min(likely) - 1.0, max(likely) + 1.0
         delays = np.arange(max(first, 1.0), min(last, most) + 0.5 * _STEP, _STEP)
-        values = np.array([fit.of(delay, _FEW_UPDATES) for delay in delays])
+        values = np.zeros((len(delays), 2))
+        for side in np.flatnonzero(delays > whole), np.flatnonzero(delays <= whole)[::-1]:
+            fit.begin()
+            fit.of(whole)
+            values[side] = [fit.of(delay, _FEW_UPDATES) for delay in delays[side]]
         weight = np.exp((values[:, 1].min() - values[:, 1]) / misfit**2)
         weight /= weight.sum()
         delay = float(weight @ delays)
@@ -391,4 +396,5 @@ def _turbulence(
         for distinct in full if axis is not None else [np.mean(full, axis=0)]:
             parts.append(basis.T @ spectra.matrices(distinct).real @ basis)
     noise = np.broadcast_to(np.eye(basis.shape[1]), parts[0].shape)
-    return np.array([*parts, noise])
+    falls = np.exp(-np.square(np.divide.outer(bins / len(window), _SMOOTH).T))[..., None, None]
+    return np.array([*parts, *(fall * part for fall in falls for part in parts), noise])
