@@ -34,6 +34,20 @@ def test_integrator_drives_first() -> None:
     assert not chosen[62:].any()
 
 
+@pytest.mark.parametrize(
+    ("prefers_plain", "ratio", "drives"), [(False, 0.95, 1), (True, 0.98, 0), (False, 1.05, 0)]
+)
+def test_few_commands_follow_their_recording_unless_residuals_contradict(
+    prefers_plain: bool, ratio: float, drives: int
+) -> None:
+    """Residuals of two commands scatter so much that in 450 frames they show no difference of 2 %."""
+    guard, rng = np.zeros(GUARD_NUMBERS), np.random.default_rng(1)
+    prepare(guard, prefers_plain, math.inf, 60, 2)
+    for plain in rng.chisquare(2, 450):
+        CHOOSE(guard, ratio * plain * math.exp(0.2 * rng.standard_normal()), plain)
+    assert guard[CHOSEN] == 1 - drives
+
+
 def test_filter_that_leaves_more_loses_the_mirror_though_its_model_says_less() -> None:
     """Each time for twice as long."""
     chosen = driven(1.5, 1.0, 4000)

@@ -224,7 +224,7 @@ def _gain_of_law(modes: Floats, sent: Floats, run: NDArray[np.int64], before: in
 LEAST_MEASURED = 0.5
 """Part of a frame's slopes without which no mode of it is known; slopes that are missing count as 0."""
 _SHORTEST, _LONGEST = 64, 4096  # frames of a piece
-_PIECES = 6
+_PIECES = 4
 _PLATEAU = 0.35  # cycles a frame, above which a spectrum is noise
 _OF_MEDIAN, _NOT_FLAT = (
     2.5,

@@ -227,7 +227,7 @@ class LoopInModes:
 Kind = Callable[[Kalman, LoopPlant, OpenLoopTelemetry, LoopInModes], Kalman]
 
 _ORDERS = (4, 8, 12, 20, 30, 50, 80, 120, 200)
-_FRAMES_FOR_ORDER = 80  # frames of a recording for each coefficient
+_FRAMES_FOR_ORDER = 50  # frames of a recording for each coefficient
 _SPECTRUM_FOR_ORDER = 5  # frames of a piece of the spectrum for each coefficient
 _BLOCKS, _MOST_COMPARED = 4, 100  # of frames left out, and modes, by which orders are compared
 _FEWEST_COUPLED, _MOST_SOURCES = 8, 60

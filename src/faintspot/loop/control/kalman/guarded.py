@@ -133,6 +133,8 @@ def prepare(guard: Any, prefers_plain: bool, plain_residual: float, plain_frames
     guard[_PATIENCE] = patience = max(1.0, _MANY_COMMANDS / commands)
     guard[CHOSEN] = guard[SENT] = guard[_BEFORE] = float(prefers_plain or plain_frames > 0)
     guard[_COMPUTED], guard[_WAIT], guard[_NEXT_WAIT] = plain_residual, plain_frames * patience, _FIRST_WAIT
+    if not prefers_plain:  # its recording speaks for it: evidence as with many commands is enough
+        guard[_EVIDENCE] = _ENOUGH * (1.0 - 1.0 / patience)
 
 
 def restart(guard: Any) -> None:
