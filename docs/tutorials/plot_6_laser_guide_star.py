@@ -99,5 +99,4 @@ bound = fs.cramer_rao_covariance(200.0, psf, layout.window, detector=camera)
 print(f"Cramer-Rao bound     {np.sqrt(np.trace(bound, axis1=1, axis2=2).mean() / 2):.3f} px")
 
 # %%
-# Gains and what limits them: :doc:`/results/laser_guide_stars`. In a closed loop, with a natural star for
-# tip, tilt and focus: ``faintspot loop magnitude lgs_eight_metre``.
+# Gains and what limits them: :doc:`/results/laser_guide_stars`.

@@ -228,7 +228,10 @@ def _guarded_scratch(at_end: bool) -> Iterator[None]:
         return guarded_tree(new_scratch(*arguments), at_end)
 
     known = vars(parallel._local)  # what this thread has made already
-    with mock.patch.object(parallel, "new_scratch", make), mock.patch.object(slope_pipeline, "new_scratch", make):
+    with (
+        mock.patch.object(parallel, "new_scratch", make),
+        mock.patch.object(slope_pipeline, "new_scratch", make),
+    ):
         known.pop("known", None)
         yield
         known.pop("known", None)

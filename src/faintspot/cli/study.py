@@ -265,9 +265,8 @@ def magnitude(
     recommended for each flux: the simplest of those not below the best beyond the error. Methods:
     every estimator by its name (`faintspot estimators` lists them); after the name may follow
     +predicted (its prior is what the loop predicts), +weighted (slopes count by their standard errors),
-    +uncorrected (slopes are not divided by the centroid gain), with a laser guide star +filter (weights of
-    `window` are the linear matched filter) and +followed (the sodium profile is followed), and then the
-    control: +kalman in place of the integrator.
+    +uncorrected (slopes are not divided by the centroid gain), and then the control: +kalman in place of the
+    integrator.
 
     \b
     Examples:

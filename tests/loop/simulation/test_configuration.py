@@ -19,7 +19,6 @@ REGIMES = {
     "elongated_10e",
     "open_loop",
     "eight_metre",
-    "lgs_eight_metre",
 }
 
 
@@ -65,10 +64,6 @@ def test_what_estimators_know() -> None:
     r0_m = 0.15 * (loop.sensor.wavelength_m / 500e-9) ** 1.2
     assert scene.d_over_r0 == pytest.approx(0.6 / r0_m)
     assert LoopConfiguration().scene.excess_noise == 1.0
-    laser = LoopConfiguration().replace("laser", spot_fwhm_arcsec=1.2)
-    width = np.hypot(0.886 * 2.0, 1.2 / np.degrees(laser.pixel_scale_rad) / 3600)
-    assert laser.scene.spot_fwhm_px == pytest.approx(width)
-    assert laser.scene.elongation == 1.0
 
 
 def test_sizes_of_the_default() -> None:

@@ -181,9 +181,6 @@ LOOP_GAIN = "loop_gain"
 NOISE_SCALE = "noise_scale"
 # How far spots are from where a prior expects them is the loop's to say: parts of their range.
 _PRIORS = (0.1, 0.175, 0.25, 0.35, 0.5, 0.75)
-_METHODS_OF_LASER = (
-    "window", "window+filter", "window+filter+followed", "ml+followed", "map+predicted+followed"
-)  # fmt: skip
 _STEPS_BEYOND = 2  # in the ratio of an end to its neighbour
 _FEWEST_TO_WIDEN = 4
 _FIRST_VALUES = (3, 2)  # of a method's first option, and of each further one
@@ -224,8 +221,6 @@ def tuned_values(method: methods.Method, configuration: LoopConfiguration) -> di
         options[methods.PRIOR] = [part * reach for part in _PRIORS]
     if method.control == KALMAN:
         options.pop(methods.PRIOR, None)  # the filter knows it
-    if methods.FILTER in method.variants:
-        options = {}  # the spots determine it
     tuned = {LOOP_GAIN: _LOOP_GAINS if method.control == INTEGRATOR else _TELEMETRY_GAINS}
     if method.control == KALMAN and estimator.takes_prior:
         tuned[NOISE_SCALE] = _NOISE_SCALES
@@ -245,7 +240,7 @@ def with_choice(
     Raises
     ------
     InputError
-        When a value is missing, or the method needs a laser.
+        When a value is missing.
     """
     missing = [] if choice is None else [n for n in tuned_values(method, configuration) if n not in choice]
     if missing:
@@ -253,13 +248,8 @@ def with_choice(
     options = dict(choice or {})
     gain, noise_scale = options.pop(LOOP_GAIN, None), float(options.pop(NOISE_SCALE, 1.0))
     estimator = method.estimator.for_scene(configuration.scene).replaced(options)
-    laser, needs_psf = configuration.laser is not None, Need.PSF in estimator.required
-    if not laser and {methods.FILTER, methods.FOLLOWED} & set(method.variants):
-        raise InputError(f"method = {method.name!r}: expected a configuration with a laser")
-    reach = configuration.position_range_px() if laser and needs_psf else None
-    psf = _flat_psf(configuration) if needs_psf and not laser else None
-    settings = Settings(estimator, search_range_px=reach)
-    return replace(method, settings=settings, gain=gain, noise_scale=noise_scale, psf=psf)
+    psf = _flat_psf(configuration) if Need.PSF in estimator.required else None
+    return replace(method, settings=Settings(estimator), gain=gain, noise_scale=noise_scale, psf=psf)
 
 
 def default_methods(configuration: LoopConfiguration) -> list[str]:
@@ -270,10 +260,7 @@ def default_methods(configuration: LoopConfiguration) -> list[str]:
     estimator and the one that gains most from a prior also with the Kalman filter. In open loop, where an
     error of the centroid gain is not fed back, those that know nothing of the spot also without its
     correction.
-    With a laser guide star, those that suit elongated spots, with the profile learnt before and followed.
     """
-    if configuration.laser is not None:
-        return list(_METHODS_OF_LASER)
     names = []
     for name, kind in estimators().items():
         names.append(name)

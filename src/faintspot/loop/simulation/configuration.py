@@ -23,7 +23,6 @@ from faintspot.slopes.spots.shapes import R0_WAVELENGTH_M
 
 SPOT_FWHM = 0.886  # full width at half maximum of sinc^2, in lambda / d
 _MOST_POINTS = 4096**2  # of a wavefront
-_POINT_FIELD = 0.9  # of a window that holds a laser guide star
 _POSITION_RANGE_PX = {sections.CLOSED: 2.0, sections.OPEN: 5.0}
 
 
@@ -55,18 +54,15 @@ class LoopConfiguration:
     control: sections.ControlParameters = field(default_factory=sections.ControlParameters)
     science: sections.Science = field(default_factory=sections.Science)
     run: sections.RunLength = field(default_factory=sections.RunLength)
-    laser: sections.Laser | None = None
-    natural_star: sections.NaturalStar | None = None
 
     def __post_init__(self) -> None:
         if not isinstance(self.name, str) or not self.name:
             raise InputError(f"name: expected a text, got {self.name!r}")
         for name in SECTIONS:
-            if name not in _OPTIONAL or getattr(self, name) is not None:
-                section = getattr(self, name)
-                if not isinstance(section, SECTIONS[name]):
-                    got = type(section).__name__
-                    raise InputError(f"expected {SECTIONS[name].__name__}, got {got}", name=name)
+            section = getattr(self, name)
+            if not isinstance(section, SECTIONS[name]):
+                got = type(section).__name__
+                raise InputError(f"expected {SECTIONS[name].__name__}, got {got}", name=name)
         _check_layers(self.atmosphere)
         _check_flux(self.camera)
         _check_sampling(self)
@@ -81,7 +77,7 @@ class LoopConfiguration:
         """
         check_known("", section, SECTIONS, "section")
         check_keys(f"{section}.", values, [item.name for item in fields(SECTIONS[section])])
-        changed: Any = dataclasses.replace(getattr(self, section) or SECTIONS[section](), **values)
+        changed: Any = dataclasses.replace(getattr(self, section), **values)
         return dataclasses.replace(self, **{section: changed})
 
     def slowed_to(self, rate_hz: float) -> LoopConfiguration:
@@ -134,12 +130,12 @@ class LoopConfiguration:
     def scene(self) -> Scene:
         """Knowledge that estimators have when their options are chosen."""
         camera = self.camera
-        width, elongation = self._spot_fwhm_and_elongation
+        elongation = self.sensor.spot_elongation
         return Scene(
             flux_e=self.photons,
             read_noise_e=camera.read_noise_e / camera.em_gain,
             window=(self.sensor.pixels,) * 2,
-            spot_fwhm_px=width * math.sqrt(elongation),
+            spot_fwhm_px=SPOT_FWHM * self.spot_width_px * math.sqrt(elongation),
             position_range_px=self.position_range_px(),
             elongation=elongation,
             excess_noise=2.0 if camera.em_gain > 1 else 1.0,
@@ -147,15 +143,6 @@ class LoopConfiguration:
             d_over_r0=self.d_over_r0,
             diffraction_px=self.spot_width_px,
         )
-
-    @property
-    def _spot_fwhm_and_elongation(self) -> tuple[float, float]:
-        """Width of a spot's short axis [px], and its elongation, which a laser adds itself."""
-        width = SPOT_FWHM * self.spot_width_px
-        if self.laser is None:
-            return width, self.sensor.spot_elongation
-        pixel_arcsec = self.pixel_scale_rad / ARCSEC
-        return math.hypot(width, self.laser.spot_fwhm_arcsec / pixel_arcsec), 1.0
 
     @property
     def photons(self) -> float:
@@ -226,10 +213,7 @@ SECTIONS: dict[str, type[ConfigurationTable]] = {
     "control": sections.ControlParameters,
     "science": sections.Science,
     "run": sections.RunLength,
-    "laser": sections.Laser,
-    "natural_star": sections.NaturalStar,
 }
-_OPTIONAL = ("laser", "natural_star")
 
 
 def load_loop(path: str | Path) -> LoopConfiguration:
@@ -299,10 +283,6 @@ def _check_flux(camera: sections.Camera) -> None:
 
 def _check_sampling(loop: LoopConfiguration) -> None:
     """Refuse a sensor that is sampled too coarsely, and inconsistent control."""
-    if loop.natural_star is not None and loop.laser is None:
-        raise InputError("natural_star: expected a table laser beside it, got none")
-    if loop.laser is not None and loop.sensor.spot_elongation > 1:
-        raise InputError("sensor.spot_elongation: expected 1 with a laser, which elongates the spots itself")
     sensor = loop.sensor
     check_size(
         "sensor: (subapertures x samples)^2", [(sensor.subapertures * sensor.samples) ** 2], _MOST_POINTS
@@ -337,8 +317,6 @@ def _check_sampling(loop: LoopConfiguration) -> None:
 
 def field_of_view(loop: LoopConfiguration) -> float:
     """Return the width of the lenslet images that must not alias [px]."""
-    if loop.laser is not None:  # images of a point; the sodium layer is added afterwards
-        return loop.sensor.pixels * _POINT_FIELD
     return loop.sensor.pixels * 1.125 + 2 * 3 * blur_px(loop)
 
 

@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 
-from faintspot.base.errors import InputError
 from faintspot.base.files import output_errors, write_atomically
 from faintspot.loop.control.base import INTEGRATOR, KALMAN
 from faintspot.loop.control.configuration import save_control
@@ -67,8 +66,6 @@ def write_engine_files(
     MissingExtraError
         When HCIPy is not installed.
     """
-    if configuration.laser is not None:
-        raise InputError("laser: expected none, as the engine takes tip and tilt from no second sensor")
     folder = Path(folder)
     with output_errors(folder):
         folder.mkdir(parents=True, exist_ok=True)

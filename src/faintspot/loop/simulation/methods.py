@@ -14,7 +14,6 @@ from faintspot.base.errors import InputError
 from faintspot.base.options import AUTO, REQUIRED, TEXT, TEXTS, Options, number, setting
 from faintspot.loop.control.base import CONTROLS, INTEGRATOR, KALMAN
 from faintspot.slopes.estimators.base import Estimator
-from faintspot.slopes.estimators.built_in.window import Window
 from faintspot.slopes.estimators.registry import estimator_named
 from faintspot.slopes.pipeline.settings import Settings
 from faintspot.slopes.spots.fixed_weights import FixedWeights
@@ -23,13 +22,10 @@ from faintspot.slopes.spots.psf import PSF
 PRIOR = "prior_std_px"
 """Option of estimators whose prior the loop sets: standard deviation from the predicted position."""
 PREDICTED, WEIGHTED, UNCORRECTED, TRUE = "predicted", "weighted", "uncorrected", "true"
-FILTER, FOLLOWED = "filter", "followed"
 VARIANTS = {
     PREDICTED: "predicted",
     WEIGHTED: "weighted reconstructor",
     UNCORRECTED: "gain not corrected",
-    FILTER: "matched filter",
-    FOLLOWED: "profile followed",
     TRUE: "true slopes",
 }
 """Uses of an estimator in a loop that differ from the usual one: name and label."""
@@ -56,17 +52,14 @@ class Method(Options, table="method"):
         slopes count by their standard errors. "uncorrected": slopes are not divided by their centroid gain,
         as those with a prediction; else it is that measured at the run's flux, for control that learns the
         one learnt from telemetry. "true": slopes are the wavefront's true mean gradients instead of measured
-        ones. With a laser guide star "filter": the fixed weights of `window` are the linear matched filter of
-        its spots; "followed": spots are those of a sodium profile that is followed, not of the one learnt
-        before the run.
+        ones.
     control : str
         What makes commands of the slopes, see `control.base.CONTROLS`. All but the integrator
         learn from telemetry of a loop with the integrator, in other turbulence.
     noise_scale : float
         What control multiplies the variance of the slopes' noise by that telemetry shows.
     psf, score : PSF, FixedWeights, optional
-        For the estimators that need them. Default PSF: that of a flat wavefront, or with a laser that of the
-        profile learnt.
+        For the estimators that need them. Default PSF: that of a flat wavefront.
 
     Raises
     ------
@@ -115,8 +108,6 @@ class Method(Options, table="method"):
             raise InputError(f"method = {name!r}: expected the control once, at the end")
         if PREDICTED in variants and not kind.takes_prior:
             raise InputError(f"method = {name!r}: expected an estimator that takes a prior, got {first!r}")
-        if FILTER in variants and kind is not Window:
-            raise InputError(f"method = {name!r}: expected estimator {Window.name!r} for {FILTER!r}")
         if control == KALMAN and kind.takes_prior:
             variants.add(PREDICTED)
         ordered = tuple(variant for variant in VARIANTS if variant in variants)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
@@ -16,12 +15,10 @@ from faintspot.loop.control.base import INTEGRATOR, CommandDelayLine
 from faintspot.loop.simulation.configuration import LoopConfiguration
 from faintspot.loop.simulation.methods import TRUE, Method
 from faintspot.loop.simulation.record import LoopRecord, make_controller
-from faintspot.loop.simulation.sections import RunLength
 from faintspot.loop.simulation.telescope import (
     TelescopeModel,
     atmosphere_of,
     centroid_gain,
-    laser_source,
     make_detector,
     make_pipeline,
     mean_flux,
@@ -36,8 +33,6 @@ from faintspot.slopes.pipeline.slopes import Slopes
 
 if TYPE_CHECKING:
     from faintspot.loop.control.identification.model import Kalman
-    from faintspot.loop.simulation.laser import LaserRun
-    from faintspot.slopes.training.sodium import KnownSodium
 
 
 _MOST_METHODS = 127
@@ -139,9 +134,7 @@ class _Loop:
         frame_numbers: NDArray[np.int64],
     ) -> None:
         self.configuration = configuration
-        methods = [method for method, _ in ready]
-        self.laser = _laser_run(configuration, methods, seed, realisation)
-        self.methods = methods = methods if self.laser is None else self.laser.methods
+        self.methods = methods = [method for method, _ in ready]
         self.learnt = [learnt for _, learnt in ready]
         self.schedule, self.seed, self.realisation = schedule, seed, realisation
         self.frame_numbers = frame_numbers.tolist()
@@ -212,8 +205,6 @@ class _Loop:
         per_px = 1 / self.divisors[number]
         vector, covariance = (values.astype(np.float64) for values in (slopes.vector, slopes.covariance_xy))
         vector *= per_px
-        if self.laser is not None:
-            vector = self.laser.low_orders.merged(self.frame_numbers[frame], wavefront, vector, slopes.flags)
         self.controllers[number].update(vector, error.astype(np.float64) * per_px, covariance * per_px**2)
         self._note(
             frame,
@@ -244,10 +235,6 @@ class _Loop:
             prior = self.controllers[number].expected().mean_px
         pixels = self.telescope_model.frame(self.frame_numbers[frame], wavefront)
         slopes = self.pipelines[number](pixels, prior)
-        if self.laser is not None and self.laser.follow(number, pixels, slopes.vector.astype(np.float64)):
-            method = self.laser.methods[number]
-            self.pipelines[number] = make_pipeline(self.configuration, sensor, method)
-            self._follow_flux(number)
         flux = self.fluxes[number]
         if flux is not None:
             self.fluxes[number] = flux.updated(slopes.flux)
@@ -301,9 +288,7 @@ def _typical_spots(
     configuration: LoopConfiguration, seed: int, realisation: int
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     optics, atmosphere = prepare(configuration), atmosphere_of(configuration, seed, realisation)
-    laser = laser_source(configuration)
-    sensor = optics.sensor if laser is None else laser.sensor(0)
-    return typical_spots(configuration, sensor, optics.mirror, atmosphere, optics.reconstructor.matrix)
+    return typical_spots(configuration, optics.sensor, optics.mirror, atmosphere, optics.reconstructor.matrix)
 
 
 def _with_control(
@@ -315,25 +300,3 @@ def _with_control(
     from faintspot.loop.simulation.learning import learnt_control
 
     return learnt_control(configuration, method, seed, simulate_loop)
-
-
-def _laser_run(
-    configuration: LoopConfiguration, methods: Sequence[Method], seed: int, realisation: int
-) -> LaserRun | None:
-    """Return what a run with a laser guide star adds; None without one."""
-    if configuration.laser is None:
-        return None
-    from faintspot.loop.simulation.laser import LaserRun, LowOrders
-
-    known = _learnt_sodium(replace(configuration, name="-", run=RunLength()), seed, realisation)
-    sensor = prepare(configuration).sensor
-    low_orders = LowOrders(configuration, sensor, seed, realisation)
-    return LaserRun(configuration, sensor.layout, methods, known, low_orders)
-
-
-@lru_cache(maxsize=4)
-def _learnt_sodium(configuration: LoopConfiguration, seed: int, realisation: int) -> KnownSodium:
-    from faintspot.loop.simulation.laser import learn_sodium
-
-    spots = np.concatenate(_typical_spots(without_flux(configuration), seed, realisation))
-    return learn_sodium(configuration, prepare(configuration).sensor.layout, spots, seed)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,10 +35,6 @@ from faintspot.slopes.pipeline.light import MeanFlux
 from faintspot.slopes.pipeline.settings import Settings
 from faintspot.slopes.pipeline.slope_pipeline import SlopePipeline
 from faintspot.slopes.spots.psf import PSF, spot_psf
-
-if TYPE_CHECKING:
-    from faintspot.loop.simulation.laser import LaserSource
-
 
 Floats = NDArray[np.float64]
 
@@ -96,8 +92,6 @@ def reference_slopes(
 ) -> NDArray[np.float32]:
     """Return the slopes that a method measures for a flat wavefront, all x, then all y, (2 n,) px.
 
-    With a laser they are those of the spots that the method knows.
-
     References are measured with bright frames without noise, and without what is for faint flux:
     at its strength of denoising they would be denoised to nothing.
     """
@@ -109,12 +103,7 @@ def reference_slopes(
         score=method.score,
         threads=1,
     )
-    if configuration.laser is not None and method.psf is not None:  # the true spots change with time
-        n = len(sensor.layout)
-        images = method.psf.images(np.zeros((n, 2)), sensor.layout.window, which=method.psf.index_of(n))
-        flat = images.astype(np.float32)
-    else:
-        flat = sensor.spots(np.zeros((sensor.points, sensor.points), np.float32))
+    flat = sensor.spots(np.zeros((sensor.points, sensor.points), np.float32))
     return bright(sensor.frame(flat) * _BRIGHT_E).vector
 
 
@@ -151,12 +140,6 @@ def interaction_matrix(sensor: ShackHartmann, mirror: DeformableMirror) -> Float
         shape = mirror.wavefront_nm(poke)
         columns.append((slopes(shape) - slopes(-shape)) / (2 * _POKE_NM))
     return np.stack(columns, axis=1) / gain[:, None]
-
-
-def true_interaction_matrix(sensor: ShackHartmann, mirror: DeformableMirror) -> Floats:
-    """Return the mean gradients for a command of 1 nm of each actuator, (2 n, commands) px."""
-    pokes = np.eye(mirror.commands)
-    return np.stack([sensor.mean_slopes_px(mirror.wavefront_nm(poke)) for poke in pokes], axis=1)
 
 
 def typical_spots(
@@ -281,7 +264,6 @@ class TelescopeModel:
         self.atmosphere = atmosphere_of(without_flux(configuration), seed, realisation)
         self.photons = configuration.photons
         self.detector = make_detector(configuration)
-        self._laser = laser_source(configuration)
         self._sees_mirror = configuration.control.mode == CLOSED
         self._science = configuration.science
         self._seed, self._realisation = seed, realisation
@@ -304,9 +286,6 @@ class TelescopeModel:
     def frame(self, number: int, wavefront_nm: NDArray[np.float32]) -> NDArray[np.generic]:
         """Return the camera frame [ADU] of a wavefront; the number seeds its noise."""
         sensor, seeds = self.optics.sensor, (self._seed, self._realisation, number)
-        if self._laser is not None:
-            sensor = self._laser.sensor(number)
-            wavefront_nm = self._laser.jittered(wavefront_nm, seeds)
         flux = sensor.frame(sensor.spots(wavefront_nm)) * self.photons
         rng = np.random.default_rng([*seeds, 2])
         return self.detector.expose(flux, rng)
@@ -329,8 +308,6 @@ def of_optics(configuration: LoopConfiguration) -> LoopConfiguration:
     """Return the configuration without values that do not affect the optics, so that these are kept."""
     control, camera = configuration.control, Camera(photons_per_subaperture=1.0)
     kept = ControlParameters(largest_condition=control.largest_condition)
-    if configuration.laser is not None:  # which changes with time
-        kept = replace(kept, frame_rate_hz=control.frame_rate_hz)
     return replace(
         configuration,
         name="-",
@@ -338,7 +315,6 @@ def of_optics(configuration: LoopConfiguration) -> LoopConfiguration:
         camera=camera,
         control=kept,
         run=RunLength(),
-        natural_star=None,
     )
 
 
@@ -347,18 +323,6 @@ def without_flux(configuration: LoopConfiguration) -> LoopConfiguration:
     control = ControlParameters(**{name: getattr(configuration.control, name) for name in _OF_AIR})
     camera = Camera(photons_per_subaperture=1.0)
     return replace(configuration, name="-", camera=camera, control=control, run=RunLength())
-
-
-def laser_source(configuration: LoopConfiguration) -> LaserSource | None:
-    """Return the laser guide star of a configuration, None without (cached)."""
-    return None if configuration.laser is None else _laser_source(of_optics(configuration))
-
-
-@lru_cache(maxsize=2)
-def _laser_source(configuration: LoopConfiguration) -> LaserSource:
-    from faintspot.loop.simulation.laser import LaserSource
-
-    return LaserSource(configuration, _prepared(configuration).sensor)
 
 
 @lru_cache(maxsize=2)
@@ -372,8 +336,6 @@ def _prepared(configuration: LoopConfiguration) -> LoopOptics:
     pupil = make_pupil(configuration)
     sensor, mirror = make_sensor(configuration, pupil), make_mirror(configuration, pupil)
     check_controllable(mirror.commands, 2 * len(sensor.layout))
-    # Calibrated with a point source, whose images in windows for a laser are too coarse: true gradients.
-    measure = interaction_matrix if configuration.laser is None else true_interaction_matrix
-    interaction = measure(sensor, mirror)
+    interaction = interaction_matrix(sensor, mirror)
     reconstructor = make_reconstructor(interaction, configuration.control.largest_condition)
     return LoopOptics(pupil, sensor, mirror, interaction, reconstructor)

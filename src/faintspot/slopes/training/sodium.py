@@ -307,7 +307,6 @@ class KnownSodium:
     star: LaserGuideStar
     """Laser guide star; its spot includes turbulence and the motion of the spots."""
     fit: SodiumFit
-    dark_variance_e2: ArrayLike
 
     @classmethod
     def learnt(
@@ -335,12 +334,7 @@ class KnownSodium:
             altitudes = np.linspace(altitudes[0], altitudes[-1], _ALTITUDES)
         narrow = replace(star, spot=gaussian_spot(_NARROWEST_PX))
         star_and_fit = fit_spot(mean, narrow, profile.at(altitudes), dark_variance_e2=dark_variance_e2)
-        return cls(*star_and_fit, dark_variance_e2)
-
-    def updated(self, mean: MeanImages) -> KnownSodium:
-        """Return it with the profile of newer mean images."""
-        fit = fit_sodium_profile(mean, self.star, self.fit.profile, dark_variance_e2=self.dark_variance_e2)
-        return replace(self, fit=fit)
+        return cls(*star_and_fit)
 
     def psf(self, window: tuple[int, int]) -> PSF:
         """Return the PSF of every sub-aperture, for windows (ny, nx)."""
