@@ -18,7 +18,7 @@ _COMMANDS = {
     "estimators": "List the estimators, or the options of one.",
     "export": "Write telemetry as FITS (AOT), or a C library that measures slopes.",
     "layout": "Find the sub-apertures in a frame and write a configuration.",
-    "live": "Show a running engine, or a recording, as a web page.",
+    "live": "Show a running engine as a web page.",
     "loop": "Compare methods in a simulated closed loop, and recommend one.",
     "realtime": "Measure frames as they arrive and publish slopes and commands.",
     "report": "Write a web page of pictures and tables from slopes, studies or telemetry.",

@@ -1,7 +1,7 @@
 """Recorded telemetry, read from its store also while the engine runs; frame numbers left out."""
 
 import warnings
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, fields
 from pathlib import Path
@@ -197,14 +197,14 @@ def read_telemetry(path: str | Path, *, images: bool = True) -> Telemetry:
     >>> recording = read_telemetry("night.zarr", images=False)  # doctest: +SKIP
     >>> recording.x.std(axis=0), recording.latency_s.max()  # doctest: +SKIP
     """
-    stored = StoredTelemetry(path)
+    stored = _StoredTelemetry(path)
     check_bytes(stored.path, stored.size(images=images), memory_bytes() // 2, "telemetry")
     counts = {"frame": stored.frames, "image": stored.images if images else 0}
     arrays = {name: stored.read(name, 0, counts[kind.dimensions[0]]) for name, kind in ARRAYS.items()}
     return Telemetry(**arrays, changes=stored.changes, attributes=stored.attributes)
 
 
-class StoredTelemetry:
+class _StoredTelemetry:
     """A telemetry store at the time of opening, even while it is being written, read in parts.
 
     Parameters
@@ -235,8 +235,6 @@ class StoredTelemetry:
             self._group: Any = open_store(self.path)
             self.frames, self.images = (int(self.attributes[name]) for name in (FRAMES, IMAGES))
             self.changes: list[dict[str, Any]] = self.attributes.pop("changes")
-            self.frames_together = int(self._group["x"].chunks[0])
-            """Number of frames in a chunk of slopes, which is read as a whole."""
 
     def _attributes(self) -> dict[str, Any]:
         """Return the attributes; refuse what is not a telemetry store."""
@@ -265,22 +263,6 @@ class StoredTelemetry:
             arrays = list(self._group.arrays())
         left_out = () if images else ("raw", "denoised")
         return sum(array.nbytes for name, array in arrays if name not in left_out)
-
-    def check_shapes(self, kinds: Sequence[np.dtype[np.void]]) -> None:
-        """Refuse a store whose arrays do not have these types of records and images.
-
-        Raises
-        ------
-        InputError
-            When an array is missing, or its items have another shape.
-        """
-        for kind in kinds:
-            for name in stored_names(kind):
-                wanted = kind[name].shape
-                if self.read(name, 0, 0).shape[1:] != wanted:
-                    raise InputError(
-                        f"{self.path}: the store is damaged ({name}: expected items of {wanted})"
-                    )
 
     def read(self, name: str, start: int, stop: int) -> NDArray[Any]:
         """Return items `start` to `stop` of an array, by its name in `Telemetry`.

@@ -23,7 +23,6 @@ from faintspot.base.checks import number_between
 from faintspot.engine.page.server import LiveServer, serve
 from faintspot.engine.request_handlers import LENGTHY, commands_of
 from faintspot.engine.requests import ControlServer, socket_path
-from faintspot.engine.telemetry.recorder import Recorder
 from faintspot.io.telemetry import read_telemetry
 
 CHROMIUM = next((found for name in ("chromium", "chromium-browser") if (found := shutil.which(name))), None)
@@ -324,26 +323,3 @@ def test_engine_that_is_not_there_is_waited_for(open_page: Any, tmp_path: Path) 
     with served(serve, "fs_test_nobody", folder=tmp_path) as server:
         page = open_page(server.url)
         page.locator("#state").filter(has_text="waiting for the engine fs_test_nobody").wait_for()
-
-
-def test_recording_is_played(open_page: Any, engine: Running, tmp_path: Path) -> None:
-    path = tmp_path / "night.zarr"
-    assert Recorder(engine.name, path).run(n_frames=200, seconds=60).ended_because == "frames"
-    night = read_telemetry(path)
-    with served(serve, path) as server:
-        page = open_page(server.url)
-        page.locator("#player").wait_for()
-        assert page.locator("#settings-form").is_hidden()
-        page.locator("#play").click()
-        page.locator("#state").filter(has_text="paused").wait_for()
-        page.locator("#position").focus()
-        page.keyboard.press("End")
-        until(page, f"document.querySelector('#tiles dd').textContent === '{night.frame[-1]}'")
-        assert drawn(page, "raw") > 2
-        page.keyboard.press("Home")
-        until(page, f"document.querySelector('#tiles dd').textContent === '{night.frame[0]}'")
-        page.locator("#speed").select_option("0.25")
-        page.locator("#play").click()
-        page.locator("#state").filter(has_text="playing").wait_for()
-        watcher = open_page(server.url.partition("#")[0])
-        assert watcher.locator("#position").is_disabled()

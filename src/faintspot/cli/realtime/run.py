@@ -1,4 +1,4 @@
-"""faintspot realtime run, and live: the engine itself, and a web page of it or of a recording."""
+"""faintspot realtime run, and live: the engine itself, and a web page of it."""
 
 from __future__ import annotations
 
@@ -39,7 +39,6 @@ _NICENESS = 5  # the engine comes first
 
 @needs("realtime", "tornado", "pyshmem", "zarr")
 @click.command()
-@click.argument("recording", type=click.Path(path_type=Path), required=False, metavar="[RECORDING]")
 @ENGINE_NAME
 @option("--bind", default="127.0.0.1", metavar="ADDRESS", help="Address of this machine to listen on.")
 @PORT
@@ -53,7 +52,7 @@ _NICENESS = 5  # the engine comes first
     help="Folder for recordings that the page begins.",
     metavar="FOLDER",
 )
-def live(recording: Path | None, name: str, bind: str, port: int, private: bool, folder: Path) -> None:
+def live(name: str, bind: str, port: int, private: bool, folder: Path) -> None:
     """Serve a web page of the running engine NAME until Ctrl-C.
 
     The page shows frames, slopes, flux, validity, latencies and alternating methods. The printed address
@@ -63,17 +62,15 @@ def live(recording: Path | None, name: str, bind: str, port: int, private: bool,
     \b
     Examples:
       faintspot live
-      faintspot live night.zarr
+      faintspot live --port 8700
     """
     from faintspot.engine.child_processes import low_priority
     from faintspot.engine.page.server import serve
 
-    if recording is None:
-        require_linux("live without a recording")
+    require_linux("live")
     low_priority(_NICENESS)
     with stop_on_signal() as stop:
-        shown = name if recording is None else recording
-        serve(shown, stop, _say, address=bind, port=port, private=private, folder=folder)
+        serve(name, stop, _say, address=bind, port=port, private=private, folder=folder)
 
 
 @contextmanager

@@ -45,7 +45,7 @@ class Batch:
     changes: list[dict[str, Any]] = field(default_factory=list)
     """Changes of settings."""
     anew: bool = False
-    """Whether earlier data belong to another engine or another part of the recording."""
+    """Whether earlier data belong to another engine."""
 
 
 class BatchSource(Protocol):
@@ -89,7 +89,7 @@ _COMPARED = {
 
 
 class PageState:
-    """Statistics of the frames of one engine or recording.
+    """Statistics of the frames of one engine.
 
     Parameters
     ----------

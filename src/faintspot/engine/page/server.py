@@ -19,7 +19,7 @@ from pathlib import Path
 from faintspot.base.errors import InputError, MissingExtraError
 from faintspot.base.text_files import parse_json, to_json
 from faintspot.engine.page.client_requests import Access, EngineRequests, answered
-from faintspot.engine.page.engine_source import EngineSource, RecordingSource
+from faintspot.engine.page.engine_source import EngineSource
 from faintspot.engine.page.page import UPDATE_S, LatestMessages, Page, StatusPoller, packed
 from faintspot.engine.page.page_state import BatchSource
 from faintspot.engine.requests import Handler
@@ -327,7 +327,7 @@ async def _in_thread(work: Callable[[], dict[str, object]]) -> dict[str, object]
 
 
 def serve(
-    shown: str | Path,
+    name: str,
     stop: threading.Event,
     ready: Callable[[LiveServer], None],
     *,
@@ -336,12 +336,12 @@ def serve(
     private: bool = False,
     folder: str | Path = ".",
 ) -> None:
-    """Serve the page of a running engine, or of a recording, until `stop` is set.
+    """Serve the page of a running engine until `stop` is set.
 
     Parameters
     ----------
-    shown : str or Path
-        Name of the engine, which may start later and restart; or path of a recording.
+    name : str
+        Name of the engine, which may start later and restart.
     stop : event
     ready : function
         Called when the server is ready.
@@ -352,31 +352,27 @@ def serve(
     private : bool
         Whether reading needs the token even on this machine.
     folder : path
-        Folder for recordings started from the page of an engine.
+        Folder for recordings started from the page.
 
     Raises
     ------
     InputError
-        When the address is not valid or cannot be bound, or the path is not a recording.
+        When the address is not valid or cannot be bound.
     MissingExtraError
         When tornado or pyshmem is not installed.
     """
 
     async def work(used: ExitStack) -> None:
         access = Access(address, private)
-        if isinstance(shown, Path):
-            recording = RecordingSource(shown)
-            server = LiveServer(recording, recording.functions(), access, address, port)
-        else:
-            source = used.enter_context(closing(EngineSource(shown)))
-            requests = used.enter_context(closing(EngineRequests(shown, folder)))
-            server = LiveServer(source, requests.functions(), access, address, port)
+        source = used.enter_context(closing(EngineSource(name)))
+        requests = used.enter_context(closing(EngineRequests(name, folder)))
+        server = LiveServer(source, requests.functions(), access, address, port)
 
-            def send(kind: str, values: dict[str, object]) -> None:
-                recording = {"recording": requests.recording.status()} if kind == "status" else {}
-                server.tell(kind, values | recording)
+        def send(kind: str, values: dict[str, object]) -> None:
+            recording = {"recording": requests.recording.status()} if kind == "status" else {}
+            server.tell(kind, values | recording)
 
-            used.enter_context(closing(StatusPoller(shown, send)))
+        used.enter_context(closing(StatusPoller(name, send)))
         ready(server)
         await server.run(stop)
 

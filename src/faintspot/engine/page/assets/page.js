@@ -76,8 +76,7 @@ function showState() {
   const there = connected && place?.there;
   state.dataset.state = there && !held ? "live" : "waiting";
   state.textContent = !connected ? "connecting" : held ? "held" : !place ? "waiting"
-    : place.kind === "recording" ? (place.playing ? "playing" : "paused")
-      : place.there ? "live" : `waiting for the engine ${place.name}${status?.error ? `: ${status.error}` : ""}`;
+    : place.there ? "live" : `waiting for the engine ${place.name}${status?.error ? `: ${status.error}` : ""}`;
   if (!place) return;
   say("name", place.name);
   document.title = `${place.name} · faintspot`;
@@ -85,32 +84,7 @@ function showState() {
     : place.error || status?.source_refused || status?.estimator_fault || (there && status?.error) || "";
   byId("trouble").hidden = !trouble;
   say("trouble", trouble);
-  const recorded = place.kind === "recording";
-  byId("player").hidden = !recorded;
-  for (const id of ["interleave-form", "record-form", "settings-form"]) byId(id).hidden = recorded;
-  byId("change-section").hidden = recorded && !byId("controls").hidden;
-  say("counters-title", recorded ? "Settings" : "Counters");
-  byId("configuration-section").hidden = !place.settings;
-  say("configuration", place.settings || "");
-  if (recorded) showPlayer(place);
 }
-
-function showPlayer({ position_s: position, length_s: length, playing, speed }) {
-  const bar = byId("position");
-  bar.max = length;
-  if (document.activeElement !== bar || playing) bar.value = position;
-  say("moment", `${position.toFixed(1)} of ${length.toFixed(1)} s`);
-  say("play", playing ? "Pause" : "Play");
-  byId("play").dataset.playing = playing;
-  if (document.activeElement !== byId("speed")) byId("speed").value = String(speed);
-  for (const id of ["play", "position", "speed"]) byId(id).disabled = byId("controls").hidden;
-}
-byId("play").addEventListener("click", (event) =>
-  connection.ask("play", { playing: event.currentTarget.dataset.playing !== "true" }));
-byId("position").addEventListener("input", (event) =>
-  connection.ask("play", { position_s: Number(event.currentTarget.value) }));
-byId("speed").addEventListener("change", (event) =>
-  connection.ask("play", { speed: Number(event.currentTarget.value) }));
 
 // Frames -------------------------------------------------------------------------------------------------
 
