@@ -14,9 +14,9 @@ BESIDE = neighbour_vectors("square", PIXELS, 0.0)
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize(("fwhm_px", "flux_e"), [(3.0, 600.0), (5.5, 2000.0)])
-def test_background_of_lit_lenslets(kind: str, fwhm_px: float, flux_e: float) -> None:
-    """To 1 of 40 e- apart from a constant, which moves no spot; a smooth map is off by 10 at edges.
+@pytest.mark.parametrize(("fwhm_px", "flux_e", "most"), [(3.0, 600.0, 1.0), (5.5, 2000.0, 1.5)])
+def test_background_of_lit_lenslets(kind: str, fwhm_px: float, flux_e: float, most: float) -> None:
+    """To 1 of 40 e- (1.5 below wings) apart from a constant; a smooth map is off by 10 at edges.
 
     Spots that overlap leave a constant of up to a tenth of their background.
     """
@@ -29,7 +29,7 @@ def test_background_of_lit_lenslets(kind: str, fwhm_px: float, flux_e: float) ->
     lit = np.zeros((ACROSS, ACROSS), bool)
     lit[rows, columns] = True
     error = (found - 100 - SKY_E * sky)[np.kron(lit, np.ones((PIXELS, PIXELS), bool))]
-    assert error.std() < 1.0
+    assert error.std() < most
     assert abs(error.mean()) < 4.0
 
 

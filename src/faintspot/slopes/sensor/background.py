@@ -12,8 +12,10 @@ Floats = NDArray[np.float64]
 Points = NDArray[np.complex128]
 Pixels = tuple[NDArray[np.int64], NDArray[np.int64]]
 
-_WIDTHS, _ROUNDS = np.geomspace(0.4, 1.4, 36), 8  # of spots that overlap, over the width first taken
-_HASTE = 1.7  # over-relaxation of the rounds: steps between lenslets also look like slopes of smooth ones
+_WIDTHS = np.geomspace(0.4, 1.4, 36)  # of spots that overlap, over the width first taken
+# Rounds, and those with spots that overlap, whose wings become background in more; and their over-relaxation:
+# steps between lenslets first look like slopes of a smooth background.
+_ROUNDS, _ROUNDS_BELOW_WINGS, _HASTE = 8, 4, 1.7
 _HIGHEST = 0.7  # frequency of their spectra over the inverse of their width
 _COVERED, _MOST_COVERED = 3.0, 0.42  # radius of a spot in its standard deviations; at most, in pitches
 # Standard deviation of the smoothing in pitches: wings of the spots average out. At least in pixels: so does
@@ -68,7 +70,7 @@ def lenslet_background(
     usable = lit & finite & (away_px > min(max(_COVERED * spot_px, 2.0), _MOST_COVERED * pitch_px))
     smooth = _Planes(usable, max(_SMOOTHED * pitch_px, _LEAST_SMOOTHED_PX))
     taken, found, own = np.zeros((3, *frame.shape))
-    for number in range(_ROUNDS):
+    for number in range(_ROUNDS_BELOW_WINGS if overlaps else _ROUNDS):
         if overlaps and number > 0:
             taken = _overlapping(values - found - own, lit, at, spot_px)[1]
         found = smooth(values - taken - own)
