@@ -1,6 +1,7 @@
 """What a recording of a loop tells: within its errors of a truth that is known, and what it does not tell."""
 
 import math
+from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
@@ -17,7 +18,7 @@ from faintspot.loop.control.identification.open_loop import Measured, open_loop_
 from faintspot.loop.control.identification.vibrations import Vibration
 from faintspot.loop.telemetry.choices import AS_RUN, BEST, FILTER
 from faintspot.loop.telemetry.page import page_of_loop
-from faintspot.loop.telemetry.report import LoopReport, Part, _vibrations, report_of_loop
+from faintspot.loop.telemetry.report import LoopReport, Part, _noise, _vibrations, report_of_loop
 
 
 @pytest.fixture(scope="module")
@@ -46,6 +47,20 @@ def test_noise_is_found_within_5_percent(report: Any) -> None:
     """To 5 %: turbulence within two frames is no parabola."""
     assert value(report, "noise", "noise of a slope").value == pytest.approx(NOISE_PX, rel=0.05)
     assert report.noise_px == pytest.approx(np.full(50, NOISE_PX), rel=0.2)
+
+
+def test_an_uncertain_delay_makes_the_noise_uncertain() -> None:
+    """By as much as the noise differs for a delay that is earlier by its error."""
+    loop: Any = recorded()
+    loop, found = loop.part(slice(0, 1200)), []
+    for delay, error in ((1.6, 0.0), (2.0, 0.0), (2.0, 0.4)):
+        report = LoopReport(loop, defaultdict(lambda: Part("")))
+        _noise(report, LoopDelay(delay, error, 1.0, 0.0))
+        found.append(value(report, "noise", "noise of a slope"))
+    earlier, known, uncertain = found
+    assert uncertain.value == known.value
+    assert uncertain.error == pytest.approx(math.hypot(known.error, known.value - earlier.value))
+    assert uncertain.error > 2 * known.error
 
 
 def test_a_fast_vibration_is_no_noise() -> None:

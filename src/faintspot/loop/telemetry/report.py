@@ -258,6 +258,10 @@ def _noise(report: LoopReport, delay: LoopDelay) -> OpenLoop | None:
     rms = float(np.sqrt(np.square(report.noise_px[known]).mean()))
     of_each = float(open_loop.variance_error[known].mean()) / math.sqrt(known.sum())
     spread = 0.5 * rms * math.hypot(of_each, open_loop.shared_error)
+    if delay.delay_error > 0:  # what the loop has made of noise is left in the slopes of a wrong delay
+        earlier = replace(delay, delay_frames=max(delay.delay_frames - delay.delay_error, 1.0))
+        other = loop.unit * gains * np.sqrt(open_loop_of(loop, earlier).variance)
+        spread = math.hypot(spread, rms - float(np.sqrt(np.square(other[known]).mean())))
     of_spectra = "rms over the slopes, from where their spectra are flat"
     remark = of_spectra if loop.cells is None else "rms over the sub-apertures"
     part.values.append(Measured("noise of a slope", loop.slope_unit, rms, spread, remark))
