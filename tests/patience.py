@@ -1,8 +1,10 @@
 """How long tests wait for other processes and threads, and how many examples they try."""
 
 import time
+from collections.abc import Iterable
 from typing import Any
 
+import pytest
 from hypothesis import settings
 
 LIMIT_S = 60.0
@@ -23,3 +25,13 @@ def wait_for(condition: Any, what: object = "", step: Any = lambda: time.sleep(0
     while not condition():
         assert time.monotonic() < end, what() if callable(what) else what
         step()
+
+
+def mostly_slow(fast: int, cases: Iterable[Any]) -> list[Any]:
+    """Return the cases of a parametrised test, with the marker `slow` on all but the first few."""
+    return [
+        case
+        if number < fast
+        else pytest.param(*(case if isinstance(case, tuple) else (case,)), marks=pytest.mark.slow)
+        for number, case in enumerate(cases)
+    ]

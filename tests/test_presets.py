@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tests.patience import mostly_slow
 
 from faintspot import Settings
 from faintspot.base.statistics import slope_error
@@ -37,7 +38,7 @@ def cell(read_noise_e: float, flux_e: float, profile: str = "diffraction", size:
 
 @pytest.mark.parametrize(
     ("case", "keep"),
-    [(cell(3.0, 80), 12), (cell(0.1, 30), 11), (cell(0.1, 30, "gaussian"), 16)],
+    mostly_slow(1, [(cell(3.0, 80), 12), (cell(0.1, 30), 11), (cell(0.1, 30, "gaussian"), 16)]),
     ids=["nearly infeasible", "diffraction spot", "Gaussian spot"],
 )
 def test_fast_is_as_good_as_converged(case: Cell, keep: int) -> None:

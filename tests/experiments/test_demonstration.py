@@ -56,6 +56,7 @@ def test_calibrated_frames_are_the_simulated_electrons() -> None:
     assert abs(calibrated.mean()) < 0.05 * READ_NOISE_E
 
 
+@pytest.mark.slow
 def test_compare_reports_both_modes_and_its_progress() -> None:
     calls: list[tuple[int, int]] = []
     best, fixed = compare(20, np.random.default_rng(4), lambda *counts: calls.append(counts))

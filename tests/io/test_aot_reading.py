@@ -13,6 +13,7 @@ import pytest
 from numpy.typing import NDArray
 from tests.cli.cli_cases import Commands
 from tests.io.telemetry_files import ATTRIBUTES, IMAGE, RECORD, N, images_of, records_of
+from tests.patience import mostly_slow
 from tests.refusals import refused
 
 import faintspot as fs
@@ -240,16 +241,22 @@ MASK = np.array([[7, 2, -1], [0, -1, 1], [-1, 3, -1]])
 
 @pytest.mark.parametrize(
     ("change", "naming"),
-    [
-        (changed("sensor.detector", None), "one Shack-Hartmann sensor with pixels, it has: WFS1, WFS2"),
-        (pyramid, "it has: none"),
-        (changed("sensor.subaperture_mask.data", MASK), "subaperture_mask: expected the numbers 0 to 3"),
-        (changed("sensor.ref_measurements.data", np.zeros((4, 2))), "expected shape (2, 4), got (4, 2)"),
-        (changed("sensor.measurements.data", np.ones((50, 4, 2))), "measurements: expected shape (t, 2, 4)"),
-        (changed("loop.interaction_matrix.data", np.ones((3, 2, 4))), "expected shape (4, 2, commands)"),
-        (changed("sensor.mask_offsets", 2 * [aotpy.Coordinates(2.0, 1.0)]), "expected one, got 2"),
-        (changed("sensor.detector.pixel_intensities.data", np.ones(20)), "(frames, height, width)"),
-    ],
+    mostly_slow(
+        3,
+        [
+            (changed("sensor.detector", None), "one Shack-Hartmann sensor with pixels, it has: WFS1, WFS2"),
+            (pyramid, "it has: none"),
+            (changed("sensor.subaperture_mask.data", MASK), "subaperture_mask: expected the numbers 0 to 3"),
+            (changed("sensor.ref_measurements.data", np.zeros((4, 2))), "expected shape (2, 4), got (4, 2)"),
+            (
+                changed("sensor.measurements.data", np.ones((50, 4, 2))),
+                "measurements: expected shape (t, 2, 4)",
+            ),
+            (changed("loop.interaction_matrix.data", np.ones((3, 2, 4))), "expected shape (4, 2, commands)"),
+            (changed("sensor.mask_offsets", 2 * [aotpy.Coordinates(2.0, 1.0)]), "expected one, got 2"),
+            (changed("sensor.detector.pixel_intensities.data", np.ones(20)), "(frames, height, width)"),
+        ],
+    ),
 )
 def test_damaged_files_are_refused(tmp_path: Path, change: Callable[[Any], None], naming: str) -> None:
     with refused(naming):

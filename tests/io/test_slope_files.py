@@ -16,6 +16,7 @@ from tests.io.slope_files import (
     write,
     writer_for,
 )
+from tests.patience import mostly_slow
 from tests.refusals import refused
 
 from faintspot.base.errors import MissingExtraError
@@ -102,7 +103,7 @@ def test_csv_is_written_in_pieces(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 
 
 @pytest.mark.parametrize("name", ["flags", "centre_x"])
-@pytest.mark.parametrize("damage", ["lost", "empty", "short", "bit"])
+@pytest.mark.parametrize("damage", mostly_slow(2, ["lost", "empty", "short", "bit"]))
 def test_damaged_chunk_of_a_store(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, damage: str
 ) -> None:

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from tests.cli.cli_cases import Commands
+from tests.patience import mostly_slow
 from tests.shared_data import shared_file
 from tests.slopes.sensor.sensor_cases import spot_frame
 
@@ -248,11 +249,14 @@ def test_nan_pixels_and_frames_do_not_count(folder: Path, run: Commands) -> None
 @pytest.mark.usefixtures("no_picture")
 @pytest.mark.parametrize(
     ("name", "geometry", "shape", "lowest", "highest"),
-    [
-        ("data/ciao_bench_60x224x224.npz", "square", None, 49, 49),
-        ("data/auto_wfs_0037_ave.fits.gz", "square", (14, 14), 144, 152),
-        ("data/test_newf9.fits.gz", "hexagonal", None, 141, 149),
-    ],
+    mostly_slow(
+        1,
+        [
+            ("data/ciao_bench_60x224x224.npz", "square", None, 49, 49),
+            ("data/auto_wfs_0037_ave.fits.gz", "square", (14, 14), 144, 152),
+            ("data/test_newf9.fits.gz", "hexagonal", None, 141, 149),
+        ],
+    ),
 )
 def test_real_frames_give_their_lenslets(
     folder: Path, run: Commands, name: str, geometry: str, shape: Any, lowest: int, highest: int
@@ -384,7 +388,7 @@ def test_doubts_are_repeated_until_they_are_accepted(folder: Path, run: Commands
 
 
 @pytest.mark.usefixtures("only_found")
-@pytest.mark.parametrize("bad", [0, 3, 7])
+@pytest.mark.parametrize("bad", mostly_slow(1, [0, 3, 7]))
 def test_one_bad_frame_does_not_decide_the_settings(folder: Path, run: Commands, bad: int) -> None:
     """Overexposed, with stray light, or without flux; and frames that a grabber wrote twice."""
     good = np.concatenate([frames(n_frames=7), frames(n_frames=1)]).astype(np.float64)

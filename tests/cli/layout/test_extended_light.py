@@ -7,6 +7,7 @@ import pytest
 from scipy.spatial import cKDTree
 from tests.cli.cli_cases import Commands
 from tests.cli.layout.extended_light import eye_frame, flat_frame, mosaic_frames
+from tests.patience import mostly_slow
 
 from faintspot import Layout, SlopePipeline
 from faintspot.slopes.pipeline import configuration
@@ -21,7 +22,7 @@ def window_middles(layout: Layout) -> np.ndarray:
     return layout.corners[:, ::-1] + 0.5 * (np.array(layout.window[::-1]) - 1)
 
 
-@pytest.mark.parametrize("reflection_e", [0.0, 200.0, 500.0])
+@pytest.mark.parametrize("reflection_e", mostly_slow(1, [0.0, 200.0, 500.0]))
 def test_reflection_spoils_no_settings_and_slopes(folder: Path, run: Commands, reflection_e: float) -> None:
     """Flux and FWHM as without it, and slopes 4 pitches away: 0.07 px rms, of 20 % more at the most."""
     pixels, spots = flat_frame(reflection_e)
@@ -40,7 +41,7 @@ def test_reflection_spoils_no_settings_and_slopes(folder: Path, run: Commands, r
     assert np.hypot(*errors[slopes.valid].T).max() < 1.0
 
 
-@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("seed", mostly_slow(1, [1, 2]))
 def test_defaults_in_eyes(folder: Path, run: Commands, seed: int) -> None:
     """Scaled median deviations, of narrow centroids 0.57 px: a few lenslets have reflections for spots."""
     pixels, spots = eye_frame(seed)
@@ -96,7 +97,7 @@ def test_flat_field_corrects_a_colour_mosaic(folder: Path, run: Commands) -> Non
 
 
 @pytest.mark.usefixtures("no_trials")
-@pytest.mark.parametrize("kind", ["offset", "pattern", "with light"])
+@pytest.mark.parametrize("kind", mostly_slow(1, ["offset", "pattern", "with light"]))
 def test_a_dark_never_makes_a_layout_worse(folder: Path, run: Commands, kind: str) -> None:
     """The same windows as without a dark, except for single ones at the pupil's edge."""
     pixels, spots = eye_frame(1)

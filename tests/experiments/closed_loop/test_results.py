@@ -10,6 +10,7 @@ from hypothesis.extra.numpy import arrays
 from numpy.typing import ArrayLike, NDArray
 from tests.experiments.experiment_cases import small
 from tests.experiments.result_cases import made_up_magnitude
+from tests.patience import mostly_slow
 from tests.refusals import refused
 
 from faintspot.base.errors import InputError
@@ -220,7 +221,7 @@ def first_choice(name: str) -> dict[str, Any]:
 BRIGHT = small().replace("camera", photons_per_subaperture=1000.0)
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", mostly_slow(4, NAMES))
 def test_every_method_closes_the_loop(name: str) -> None:
     """Not for long and not well, but better than no correction: Strehl ratio 0.17 then."""
     kind = Method.named(name)

@@ -90,6 +90,7 @@ def test_without_rounds_the_best_coarse_choice(hill: list[Any]) -> None:
     assert found.choice == {LOOP_GAIN: GAINS.first[-1], "keep_brightest": nearest}
 
 
+@pytest.mark.slow
 def test_is_repeatable_and_stored() -> None:
     centroid = Method.named("centroid")
     one, other = (tune(centroid, small(), SEARCH) for _ in range(2))

@@ -83,6 +83,7 @@ def test_an_interrupted_night_goes_on(tmp_path: Path) -> None:
         run_night(LOOP, interrupted, plan=replace(PLAN, keep_brightest=9), pool=HERE)
 
 
+@pytest.mark.slow
 def test_in_open_loop(tmp_path: Path) -> None:
     loop = LOOP.replace("control", mode="open")
     night = run_night(loop, tmp_path, plan=replace(PLAN, repeats=(1, 1)), pool=HERE)

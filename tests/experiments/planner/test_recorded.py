@@ -91,6 +91,7 @@ def test_bright_frames_with_little_photon_noise_have_an_answer() -> None:
     assert answer.best.statistics.error.value < 0.02
 
 
+@pytest.mark.slow
 def test_a_faint_recording_has_the_range_of_its_spots() -> None:
     rng = np.random.default_rng(3)
     layout, camera = Layout.grid((6, 6), pixels=16), Detector(read_noise_e=3.0, offset_adu=100.0)

@@ -86,6 +86,7 @@ def test_tv_is_not_recommended_for_gaussian_spots_without_read_noise() -> None:
     assert abs(answer["tv"].over_brightest.value) < 0.1
 
 
+@pytest.mark.slow
 def test_speckled_spots_are_measured_without_trusting_their_mean() -> None:
     answer = answered(
         fwhm_px=None,

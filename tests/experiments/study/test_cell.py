@@ -92,6 +92,7 @@ def test_background_is_subtracted_and_its_noise_stays() -> None:
     assert images.var(dtype=np.float64) == pytest.approx(noise**2, rel=5 * 1.6 / np.sqrt(images.size))
 
 
+@pytest.mark.slow
 def test_standard_errors_are_right() -> None:
     """Spread of R over 40 seeds against its standard error: chi-squared, 39 degrees, 1e-4 in each tail."""
     errors, variances = [], []

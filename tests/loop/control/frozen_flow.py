@@ -27,10 +27,8 @@ def frozen_slopes(air: SlopeTurbulence, frames: int, rate_hz: float, rng: np.ran
         moved = 2 * np.pi * np.outer(time, wave @ wind)
         place = 2 * np.pi * air.positions_m @ wave.T
         one, other = rng.standard_normal((2, WAVES)) * strength
-        for axis in (0, 1):
-            rise = 2 * np.pi * wave[:, axis]
-            cosine = (other * rise) * np.cos(moved) - (one * rise) * np.sin(moved)
-            sine = (one * rise) * np.cos(moved) + (other * rise) * np.sin(moved)
-            n = len(place)
-            total[:, axis * n : (axis + 1) * n] += cosine @ np.cos(place).T + sine @ np.sin(place).T
+        rise = 2 * np.pi * np.repeat(wave, len(place), axis=1)  # of x slopes, then of y slopes
+        cosine, sine = (np.tile(each(place).T, 2) * rise for each in (np.cos, np.sin))
+        total += np.cos(moved) @ (other[:, None] * cosine + one[:, None] * sine)
+        total += np.sin(moved) @ (other[:, None] * sine - one[:, None] * cosine)
     return np.asarray(total * (R0_WAVELENGTH_M / (2 * np.pi) / air.pixel_scale_rad))

@@ -22,6 +22,7 @@ def _one_layer() -> LoopConfiguration:
     return quiet().replace("atmosphere", **layer)
 
 
+@pytest.mark.slow
 def test_structure_function_is_von_karmans() -> None:
     """Over whole screens: the expectation is met within 5 %, five times what 3 x 4 screens scatter."""
     separations = np.array([1, 2, 4, 12, 40, 80])

@@ -127,7 +127,7 @@ def test_noise_free_loop_lies_between_fitting_error_and_its_budget() -> None:
 
 
 def test_open_loop_control() -> None:
-    loop = load_loop("open_loop").replace("run", frames=80, settle_frames=30)
+    loop = load_loop("open_loop").replace("run", frames=50, settle_frames=25)
     settings = fs.Settings("brightest", keep_brightest=150)
     bright = loop.replace("camera", photons_per_subaperture=2000.0)
     corrected = simulate_loop(bright, [Method("corrected", settings)])
@@ -136,7 +136,7 @@ def test_open_loop_control() -> None:
     assert corrected.mean_strehl() > not_corrected.mean_strehl()
     assert corrected.loop.control.mode == "open"
     # The sensor sees the whole wavefront: slopes do not shrink when the mirror acts.
-    assert np.std(corrected.slopes_px[40:]) > 0.7 * np.std(corrected.slopes_px[:3])
+    assert np.std(corrected.slopes_px[30:]) > 0.7 * np.std(corrected.slopes_px[:3])
 
 
 def test_centroid_gain_falls_with_noise_and_brightest_pixels() -> None:

@@ -10,6 +10,7 @@ from tests.cli.cli_cases import Commands
 from tests.io import loop_layouts
 from tests.io.telemetry_files import ATTRIBUTES, IMAGE, RECORD, SIZES, images_of, records_of
 from tests.loop.telemetry.loop_cases import CELLS, recorded
+from tests.patience import mostly_slow
 
 import faintspot as fs
 from faintspot.base.errors import InputError
@@ -287,7 +288,7 @@ def test_slopes_of_frames_are_those_of_an_open_loop(tmp_path: Path) -> None:
 OPTIONS: dict[str, Any] = {"subaperture_m": 0.6, "pixel_scale_arcsec": 0.2, "slope_unit": "px"}
 
 
-@pytest.mark.parametrize("writer", list(loop_layouts.WRITERS))
+@pytest.mark.parametrize("writer", mostly_slow(1, list(loop_layouts.WRITERS)))
 def test_files_of_others_give_the_same_loop(tmp_path: Path, writer: str) -> None:
     """With their matrices, frame rate and lost frames; what was taken from where is the first remark."""
     pytest.importorskip("astropy")

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from benchmarks.following import Case, Recording, recording
 from numpy.typing import NDArray
+from tests.patience import mostly_slow
 from tests.refusals import refused
 
 import faintspot as fs
@@ -26,14 +27,17 @@ def share_of_wrong(record: Recording, slopes: fs.Slopes) -> float:
 
 @pytest.mark.parametrize(
     "case",
-    [
-        Case(frames=20),
-        Case(frames=20, geometry="hexagonal"),
-        Case(frames=20, across=6, flux_e=300.0),
-        Case(frames=20, jitter=0.15),
-        Case(frames=20, missing=0.2),
-        Case(only_last=True, order=3),
-    ],
+    mostly_slow(
+        2,
+        [
+            Case(frames=20),
+            Case(frames=20, geometry="hexagonal"),
+            Case(frames=20, across=6, flux_e=300.0),
+            Case(frames=20, jitter=0.15),
+            Case(frames=20, missing=0.2),
+            Case(only_last=True, order=3),
+        ],
+    ),
     ids=lambda case: (
         f"{case.geometry}-{case.across}-{case.flux_e:g}-{case.jitter}-{case.missing}-{case.order}"
     ),

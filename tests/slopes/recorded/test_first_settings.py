@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from tests.patience import mostly_slow
 
 import faintspot as fs
 from faintspot.slopes.recorded.first_settings import FirstSettings, first_settings
@@ -37,7 +38,7 @@ def error(
 
 
 @pytest.mark.parametrize(
-    ("flux_e", "read_noise_e"), [(50, 0.1), (200, 3.0), (2000, 3.0), (40, 3.0), (10, 3.0)]
+    ("flux_e", "read_noise_e"), mostly_slow(2, [(50, 0.1), (200, 3.0), (2000, 3.0), (40, 3.0), (10, 3.0)])
 )
 def test_not_worse_than_a_fixed_window_or_the_reference(flux_e: float, read_noise_e: float) -> None:
     """At most 5 % worse, which is three standard errors of 360 slopes that share their images."""
@@ -54,7 +55,7 @@ def test_not_worse_than_a_fixed_window_or_the_reference(flux_e: float, read_nois
     assert reached < 1.05 * float(np.abs(truth).mean())
 
 
-@pytest.mark.parametrize("range_px", [0.0, 1.0, 3.0])
+@pytest.mark.parametrize("range_px", mostly_slow(1, [0.0, 1.0, 3.0]))
 def test_spots_that_move_more_get_a_larger_range(range_px: float) -> None:
     """The whole window, where a smaller range does not help: frames to come may be aberrated more."""
     images, _ = fs.slopes.simulate.subapertures(
@@ -96,7 +97,7 @@ def sharp_spots(fwhm_px: float) -> tuple[FirstSettings, float]:
     return found, float(np.abs(errors - errors.mean(axis=0)).max())
 
 
-@pytest.mark.parametrize("fwhm_px", [0.6, 0.7, 0.8, 0.9, 1.0, 1.3])
+@pytest.mark.parametrize("fwhm_px", mostly_slow(2, [0.6, 0.7, 0.8, 0.9, 1.0, 1.3]))
 def test_sharp_spots_at_every_place_in_their_pixels(fwhm_px: float) -> None:
     """Less than 0.03 px of systematic error: the settings, and the PSF where a fit needs it."""
     found, error_px = sharp_spots(fwhm_px)
@@ -157,6 +158,7 @@ def test_spots_as_wide_as_their_neighbours_are_far(fwhm_px: float) -> None:
     assert 0.4 * at_edge_px < found.at_edge_px < max(1.5 * at_edge_px, 0.01)
 
 
+@pytest.mark.slow
 def test_spots_almost_as_wide_as_the_largest_window_have_settings() -> None:
     """Also of a weight 1.6 times as wide as 54 px."""
     away = np.arange(64) - 31.5 - np.array([[-90], [0], [90]])

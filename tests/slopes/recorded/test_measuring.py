@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 from tests.cli.cli_cases import CONFIGURATION, LAYOUT, assert_equal, expected, simulated
+from tests.patience import mostly_slow
 
 import faintspot
 from faintspot import InputError
@@ -54,7 +55,8 @@ def test_blocks_and_progress(made: Recording) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "stops"), [("s.zarr", (1,)), ("s.fits", (7, 20)), ("s.npz", (30,)), ("s.csv", (30,))]
+    ("name", "stops"),
+    mostly_slow(2, [("s.zarr", (1,)), ("s.fits", (7, 20)), ("s.npz", (30,)), ("s.csv", (30,))]),
 )
 def test_stopped_anywhere_it_goes_on(made: Recording, name: str, stops: tuple[int, ...]) -> None:
     pytest.importorskip("zarr")
@@ -71,13 +73,16 @@ def test_stopped_anywhere_it_goes_on(made: Recording, name: str, stops: tuple[in
 
 @pytest.mark.parametrize(
     "change",
-    [
-        {"denoise": False},
-        {"reference": np.full((16, 2), 0.1)},
-        {"configuration": CONFIGURATION.replace("2.0", "2.5")},
-        {"frames": simulated(seed=2)},
-        {"frames": simulated()[:29]},
-    ],
+    mostly_slow(
+        2,
+        [
+            {"denoise": False},
+            {"reference": np.full((16, 2), 0.1)},
+            {"configuration": CONFIGURATION.replace("2.0", "2.5")},
+            {"frames": simulated(seed=2)},
+            {"frames": simulated()[:29]},
+        ],
+    ),
     ids=["denoise", "reference", "settings", "frames", "fewer frames"],
 )
 def test_another_run_does_not_go_on_with_this_one(made: Recording, change: Any) -> None:

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from tests.patience import mostly_slow
 from tests.slopes.sensor.sensor_cases import RATIOS, spot_frame
 
 import faintspot as fs
@@ -49,7 +50,7 @@ def inside(layout: fs.Layout, spots: NDArray[np.complex128]) -> NDArray[np.bool_
     return np.asarray(((at > first) & (at < first + np.array(layout.window[::-1]))).all(axis=-1))
 
 
-@pytest.mark.parametrize("geometry", ["square", "hexagonal"])
+@pytest.mark.parametrize("geometry", mostly_slow(2, ["square", "hexagonal"]))
 @pytest.mark.parametrize(("coma", "seed"), [(0.6, 0), (1.0, 1), (1.4, 2), (1.4, 3)])
 def test_windows_follow_spots_that_coma_moves(geometry: str, coma: float, seed: int) -> None:
     """Every spot lies in the window of its own lenslet, and is measured from that lenslet's node."""
@@ -105,7 +106,7 @@ def test_spots_at_their_window_s_edge_and_unlike_their_neighbours_are_doubtful()
     assert not narrow[np.arange(len(narrow.layout)) != moved].unlike.any()
 
 
-@pytest.mark.parametrize("place", ["inside", "at the edge", "beside another ghost"])
+@pytest.mark.parametrize("place", mostly_slow(1, ["inside", "at the edge", "beside another ghost"]))
 def test_a_ghost_in_a_dark_lenslet_is_not_taken_for_its_spot(place: str) -> None:
     """It has a sixth of the flux of the spots around it, a tenth of a pitch off the node."""
     truth = comatic(0.0, seed=4)

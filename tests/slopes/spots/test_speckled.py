@@ -9,6 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.integrate import quad
+from tests.patience import mostly_slow
 from tests.refusals import assert_each_refused, refused
 
 from faintspot.slopes.estimators.centroid import centre_of_gravity
@@ -78,7 +79,7 @@ def test_natural_tilt_has_the_variance_of_the_angle_of_arrival() -> None:
     assert abs(np.mean(truth[:, 0] * truth[:, 1])) < 4.5 * expected / np.sqrt(n)
 
 
-@pytest.mark.parametrize("d_over_r0", [1.5, 4.0])
+@pytest.mark.parametrize("d_over_r0", mostly_slow(1, [1.5, 4.0]))
 def test_long_exposure_is_kolmogorovs(d_over_r0: float) -> None:
     n, size, pixels = 2500, 1.5, np.linspace(-12.0, 12.0, 25)
     tilt, rng = natural_tilt(n, d_over_r0, size, 4), np.random.default_rng(4)

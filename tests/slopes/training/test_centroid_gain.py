@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tests.patience import mostly_slow
 from tests.refusals import assert_each_refused
 
 import faintspot as fs
@@ -91,7 +92,8 @@ def measured(flux_e: float, positions: np.ndarray, relative: np.ndarray | float 
 
 
 @pytest.mark.parametrize(
-    ("flux_e", "true_px"), [(30.0, 0.0), (200.0, 0.5), (30.0, 1.0), (200.0, 2.0), (30.0, ANYWHERE)]
+    ("flux_e", "true_px"),
+    mostly_slow(2, [(30.0, 0.0), (200.0, 0.5), (30.0, 1.0), (200.0, 2.0), (30.0, ANYWHERE)]),
 )
 def test_noise_is_not_taken_for_motion(flux_e: float, true_px: float) -> None:
     positions = np.random.default_rng(8).uniform(-true_px, true_px, (SPOTS, 2))

@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tests.patience import mostly_slow
 from tests.refusals import assert_each_refused, refused
 from tests.slopes.training.psf_cases import simulated, slope_error, true_psf
 
@@ -16,12 +17,15 @@ from faintspot.slopes.training.psf_learning import learn_psf, learn_psf_from_ima
 
 @pytest.mark.parametrize(
     ("shape", "n", "flux", "read_noise", "most_lost"),
-    [
-        # 200 faint spots serve already. The loss is of R on the same 3000 spots: known to 1 %.
-        ("diffraction", 200, 30.0, 0.1, 1.05),
-        ("gaussian", 200, 200.0, 3.0, 1.03),
-        ("elongated", 2000, 100.0, 0.1, 1.03),
-    ],
+    mostly_slow(
+        1,
+        [
+            # 200 faint spots serve already. The loss is of R on the same 3000 spots: known to 1 %.
+            ("diffraction", 200, 30.0, 0.1, 1.05),
+            ("gaussian", 200, 200.0, 3.0, 1.03),
+            ("elongated", 2000, 100.0, 0.1, 1.03),
+        ],
+    ),
 )
 def test_a_learnt_psf_loses_little(shape: Any, n: Any, flux: Any, read_noise: Any, most_lost: Any) -> None:
     rng = np.random.default_rng(5)
@@ -33,6 +37,7 @@ def test_a_learnt_psf_loses_little(shape: Any, n: Any, flux: Any, read_noise: An
     assert slope_error(learnt.psf, fresh, positions, read_noise) < most_lost * best
 
 
+@pytest.mark.slow
 def test_noise_does_not_sharpen_the_peak() -> None:
     rng = np.random.default_rng(6)
     psf = true_psf("gaussian")
@@ -44,6 +49,7 @@ def test_noise_does_not_sharpen_the_peak() -> None:
     assert learnt.flux_e.mean() == pytest.approx(30.0, rel=0.03)
 
 
+@pytest.mark.slow
 def test_separable_spots_get_a_separable_psf_and_others_do_not() -> None:
     rng = np.random.default_rng(14)
     crossed = PSF.analytic("gaussian", elongation=2.5, angle_deg=[45.0, -45.0], radius_px=10, index=[0, 1])

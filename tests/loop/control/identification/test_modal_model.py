@@ -56,7 +56,7 @@ def tip_tilt() -> PredictiveControl:
 
 def test_tip_and_tilt_are_better_than_with_the_integrator(tip_tilt: PredictiveControl) -> None:
     """By 20 % of the variance, in new frames, with the guard."""
-    open_loop = wandering(np.random.default_rng(2), 4000)
+    open_loop = wandering(np.random.default_rng(2), 2500)
     plain = driven(Integrator(np.eye(2)), open_loop, np.eye(2), 3)
     tip_tilt.reset()
     assert driven(tip_tilt, open_loop, np.eye(2), 3) < 0.8 * plain

@@ -46,7 +46,7 @@ def test_frames_without_slopes_are_gaps() -> None:
 
 def test_lost_frames_here_and_there_change_neither_delay_nor_gain() -> None:
     """Of every 20 frames one is lost, and numbered; true are 2 frames and a gain of 1."""
-    loop = recorded()
+    loop = recorded().part(slice(0, 1500))
     kept = np.ones(len(loop.slopes), np.bool_)
     kept[np.random.default_rng(1).permutation(len(kept))[: len(kept) // 20]] = False
     whole, _ = measured_delay(loop)

@@ -236,7 +236,7 @@ def test_stroke_is_what_the_flat_command_leaves(recording: Recording) -> None:
     rms = float(recording.commands.std())
     flat, limit = np.linspace(-8.0, 8.0, 36) * rms, 9.0 * rms
     biased = replace(recording, commands=recording.commands + flat, flat_command=flat, largest_command=limit)
-    control = learn(biased.part(slice(0, 900)))
+    control = learn(biased.part(slice(0, 520)))
     sent = np.array([control(100 * row) for row in recording.slopes[:100]])
     assert np.abs(sent).max() == pytest.approx(limit)
 

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from tests.loop.control.driven import driven, oscillator
+from tests.patience import mostly_slow
 
 from faintspot.loop.control.identification.vibrations import (
     MODES,
@@ -32,7 +33,9 @@ def test_a_broad_maximum_is_no_vibration(seed: int) -> None:
     assert find_vibrations(_seen(seed, BUMP), _RATE_HZ, _SLOPES) == ()
 
 
-@pytest.mark.parametrize(("frequency_hz", "damping"), [(18.3, 0.002), (45.0, 0.005), (93.0, 0.006)])
+@pytest.mark.parametrize(
+    ("frequency_hz", "damping"), mostly_slow(1, [(18.3, 0.002), (45.0, 0.005), (93.0, 0.006)])
+)
 def test_a_weak_line_beside_a_broad_maximum_is_found(frequency_hz: float, damping: float) -> None:
     true = oscillator(frequency_hz, damping, 0.07)
     (found,) = find_vibrations(_seen(3, BUMP, true), _RATE_HZ, _SLOPES)

@@ -5,6 +5,7 @@ import pytest
 from benchmarks.layouts import verdict
 from benchmarks.simulated_arrays import aberrated_array, plain_small, random_array
 from numpy.typing import NDArray
+from tests.patience import mostly_slow
 from tests.slopes.sensor.sensor_cases import spot_frame
 
 from faintspot.base.errors import InputError
@@ -30,7 +31,7 @@ def nodes(across: int, pitch_px: float, angle_deg: float = 4.0) -> NDArray[np.co
     return np.asarray(pitch_px * np.exp(1j * np.radians(angle_deg)) * cells[np.abs(cells) < across / 2])
 
 
-@pytest.mark.parametrize("part", [0.3, 0.5])
+@pytest.mark.parametrize("part", mostly_slow(1, [0.3, 0.5]))
 def test_spots_between_the_lenslets_make_a_lattice_doubtful(part: float) -> None:
     """As many fill a part of the lattice that is finer by 1.4."""
     rng = np.random.default_rng(1)
@@ -40,7 +41,7 @@ def test_spots_between_the_lenslets_make_a_lattice_doubtful(part: float) -> None
     assert "only a part of the flux" in find_lenslets(frame).doubt
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", mostly_slow(1, range(4)))
 def test_a_few_spots_anywhere_are_no_lattice(seed: int) -> None:
     """One pair of spots in each direction may be a coincidence."""
     at = np.random.default_rng(seed).uniform(10, 120, (6, 2)) @ np.array([1, 1j])
@@ -49,18 +50,20 @@ def test_a_few_spots_anywhere_are_no_lattice(seed: int) -> None:
         find_lenslets(frame)
 
 
-@pytest.mark.parametrize("index", range(6))
+@pytest.mark.parametrize("index", mostly_slow(2, range(6)))
 def test_random_arrays_are_right_or_doubtful(index: int) -> None:
     assert verdict(random_array(99, index))[0] != "WRONG"
 
 
-@pytest.mark.parametrize(("seed", "index"), [(1, 35), (2, 10), (2, 62), (2, 113), (3, 38), (4, 129)])
+@pytest.mark.parametrize(
+    ("seed", "index"), mostly_slow(2, [(1, 35), (2, 10), (2, 62), (2, 113), (3, 38), (4, 129)])
+)
 def test_smooth_aberrations_of_few_lenslets_are_right_or_doubtful(seed: int, index: int) -> None:
     """Displacements of up to half a pitch, whose pitch or number of lenslets was wrong without a doubt."""
     assert verdict(aberrated_array(seed, index))[0] != "WRONG"
 
 
-@pytest.mark.parametrize("index", range(4, 8))
+@pytest.mark.parametrize("index", mostly_slow(1, range(4, 8)))
 def test_most_aberrated_arrays_are_right(index: int) -> None:
     assert verdict(aberrated_array(5, index))[0] == "right"
 

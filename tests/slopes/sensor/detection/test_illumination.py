@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from tests.patience import mostly_slow
 from tests.refusals import refused
 from tests.slopes.sensor.sensor_cases import Sensor, check_regular
 
@@ -16,37 +17,40 @@ WIDTHS = [(30, 5.2, 0.15), (12, 8.0, 0.2), (4, 100.0, 0.02), (4, 60.0, 0.2), (5,
 
 @pytest.mark.parametrize(
     "sensor",
-    [
-        {},
-        {"geometry": "hexagonal"},
-        {"pitch_px": 8.0, "lenslets": 20, "width": 0.11},
-        {"pitch_px": 33.3, "lenslets": 9, "inner": 0.0},
-        {"spider": 0.6},
-        {"geometry": "hexagonal", "spider": 0.6, "lenslets": 16},
-        {"lenslets": 5, "inner": 0.0},
-        {"haze_e": 500.0},
-        {"width": 0.2, "haze_e": 1000.0, "flux_e": 20000.0},
-        {"hot_pixels": 60},
-        {"scatter": 0.5},
-        {"gain_e_per_adu": 5.0, "flux_e": 5000.0},
-        {"gain_e_per_adu": 10.0, "flux_e": 3000.0, "bits": 8, "offset_adu": 0.0, "background_e": 0.0},
-        {"outside": 0.1},
-        {"outside": 0.1, "scatter": 0.4},
-        {"outside": 0.2, "lenslets": 15},
-        *(
-            {"geometry": geometry, "lenslets": n, "pitch_px": pitch_px, "angle_deg": angle_deg}
-            | {"inner": 0.3 if n > 6 else 0.0, "width": 0.09, "flux_e": 8.0 * pitch_px**2}
-            | {"hot_pixels": n**2 // 4}
-            for geometry in ("square", "hexagonal")
-            for n, pitch_px, angle_deg in SIZES
-        ),
-        *(
-            {"geometry": geometry, "lenslets": n, "pitch_px": pitch_px, "width": width, "angle_deg": 4.0}
-            | {"inner": 0.0, "flux_e": 3000.0 * max(width * pitch_px, 0.8), "scatter": 0.0}
-            for geometry in ("square", "hexagonal")
-            for n, pitch_px, width in WIDTHS
-        ),
-    ],
+    mostly_slow(
+        8,
+        [
+            {},
+            {"geometry": "hexagonal"},
+            {"pitch_px": 8.0, "lenslets": 20, "width": 0.11},
+            {"pitch_px": 33.3, "lenslets": 9, "inner": 0.0},
+            {"spider": 0.6},
+            {"geometry": "hexagonal", "spider": 0.6, "lenslets": 16},
+            {"lenslets": 5, "inner": 0.0},
+            {"haze_e": 500.0},
+            {"width": 0.2, "haze_e": 1000.0, "flux_e": 20000.0},
+            {"hot_pixels": 60},
+            {"scatter": 0.5},
+            {"gain_e_per_adu": 5.0, "flux_e": 5000.0},
+            {"gain_e_per_adu": 10.0, "flux_e": 3000.0, "bits": 8, "offset_adu": 0.0, "background_e": 0.0},
+            {"outside": 0.1},
+            {"outside": 0.1, "scatter": 0.4},
+            {"outside": 0.2, "lenslets": 15},
+            *(
+                {"geometry": geometry, "lenslets": n, "pitch_px": pitch_px, "angle_deg": angle_deg}
+                | {"inner": 0.3 if n > 6 else 0.0, "width": 0.09, "flux_e": 8.0 * pitch_px**2}
+                | {"hot_pixels": n**2 // 4}
+                for geometry in ("square", "hexagonal")
+                for n, pitch_px, angle_deg in SIZES
+            ),
+            *(
+                {"geometry": geometry, "lenslets": n, "pitch_px": pitch_px, "width": width, "angle_deg": 4.0}
+                | {"inner": 0.0, "flux_e": 3000.0 * max(width * pitch_px, 0.8), "scatter": 0.0}
+                for geometry in ("square", "hexagonal")
+                for n, pitch_px, width in WIDTHS
+            ),
+        ],
+    ),
     ids=lambda sensor: ", ".join(f"{name} {value}" for name, value in sensor.items()) or "plain",
 )
 def test_lattice_and_pupil_are_found(sensor: dict[str, Any]) -> None:
@@ -69,7 +73,7 @@ def test_lattice_and_pupil_are_found(sensor: dict[str, Any]) -> None:
     assert max(truth.wrong(grid)) <= max(1, 0.02 * count)
 
 
-@pytest.mark.parametrize("part", [0.2, 0.25, 0.3, 0.4])
+@pytest.mark.parametrize("part", mostly_slow(1, [0.2, 0.25, 0.3, 0.4]))
 def test_a_dim_edge_is_taken_or_left_whole(part: float) -> None:
     """Its lenslets scatter by 15 %, and the dividing flux lies where few are."""
     truth = Sensor(1, lenslets=14)
@@ -163,7 +167,7 @@ def _beam(factor: float, cut: float = np.inf) -> tuple[Sensor, NDArray[np.bool_]
     return truth, (edge > 4) & (truth.flux_e > 900.0)  # 900 e- in 1.4 px and 5.4 e- of noise: 0.06 px
 
 
-@pytest.mark.parametrize("cut", [np.inf, 3.0])
+@pytest.mark.parametrize("cut", mostly_slow(1, [np.inf, 3.0]))
 @pytest.mark.parametrize("factor", [3.0, 30.0])
 def test_every_clear_spot_of_a_beam_is_taken(factor: float, cut: float) -> None:
     truth, clear = _beam(factor, cut)

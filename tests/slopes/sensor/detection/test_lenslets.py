@@ -4,6 +4,7 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from tests.patience import mostly_slow
 from tests.refusals import refused
 from tests.shared_data import shared_file
 from tests.slopes.sensor.sensor_cases import Sensor, check_regular, lattice, spot_frame
@@ -67,19 +68,22 @@ def spots_at(positions: list[tuple[int, int]]) -> NDArray[np.float64]:
 
 @pytest.mark.parametrize(
     "image",
-    [
-        spots_at([]),
-        spots_at([(50, 60)]),
-        spots_at([(50, 60), (80, 91)]),
-        spots_at([(11, 20), (30, 100), (58, 47), (70, 113), (101, 9), (109, 76)]),
-        np.full((64, 64), 7.0),
-        np.zeros((64, 64), dtype=np.int16),
-        np.add.outer(np.arange(64.0), np.arange(70.0)),
-        np.ones(5),
-        np.ones((2, 2, 20, 20)),
-        np.ones((4, 40)),
-        np.full((40, 40), np.nan),
-    ],
+    mostly_slow(
+        5,
+        [
+            spots_at([]),
+            spots_at([(50, 60)]),
+            spots_at([(50, 60), (80, 91)]),
+            spots_at([(11, 20), (30, 100), (58, 47), (70, 113), (101, 9), (109, 76)]),
+            np.full((64, 64), 7.0),
+            np.zeros((64, 64), dtype=np.int16),
+            np.add.outer(np.arange(64.0), np.arange(70.0)),
+            np.ones(5),
+            np.ones((2, 2, 20, 20)),
+            np.ones((4, 40)),
+            np.full((40, 40), np.nan),
+        ],
+    ),
     ids=["noise", "one spot", "two spots", "scattered spots", "flat", "zero", "gradient", *"abcd"],
 )
 def test_no_lattice_is_an_error_in_one_line(image: NDArray[Any]) -> None:
@@ -121,7 +125,7 @@ def fits_frame(name: str) -> NDArray[np.float64]:
         return np.asarray(hdus[0].data, dtype=np.float64)
 
 
-@pytest.mark.parametrize("binned", [False, True])
+@pytest.mark.parametrize("binned", mostly_slow(1, [False, True]))
 @pytest.mark.parametrize("single", [False, True])
 def test_bench_frames_have_64_lenslets(binned: bool, single: bool) -> None:
     frames = bench_frames("data/ciao_bench_60x224x224.npz")
@@ -149,12 +153,15 @@ def test_bench_edge_frames() -> None:
 
 @pytest.mark.parametrize(
     ("name", "geometry", "pitch_px", "angle_deg", "illuminated"),
-    [
-        ("mmirs_wfs_0150", "square", 22.08, -0.5, 157),
-        ("auto_wfs_0037_ave", "square", 30.41, 0.0, 148),
-        ("test_newf9", "hexagonal", 37.14, 28.5, 145),
-        ("f9wfs_20200225-205600", "hexagonal", 35.02, 28.6, 143),
-    ],
+    mostly_slow(
+        1,
+        [
+            ("mmirs_wfs_0150", "square", 22.08, -0.5, 157),
+            ("auto_wfs_0037_ave", "square", 30.41, 0.0, 148),
+            ("test_newf9", "hexagonal", 37.14, 28.5, 145),
+            ("f9wfs_20200225-205600", "hexagonal", 35.02, 28.6, 143),
+        ],
+    ),
 )
 def test_telescope_frames_have_their_grid(
     name: str, geometry: str, pitch_px: float, angle_deg: float, illuminated: int
@@ -184,7 +191,7 @@ def test_reference_frame_is_illuminated_all_over() -> None:
 
 
 @pytest.mark.parametrize(
-    ("width_px", "photons", "seed"), [(0.5, 8, 2), (0.6, 15, 3), (0.8, 8, 2), (0.7, 60, 1)]
+    ("width_px", "photons", "seed"), mostly_slow(1, [(0.5, 8, 2), (0.6, 15, 3), (0.8, 8, 2), (0.7, 60, 1)])
 )
 def test_sharp_spots_on_a_clipped_background_are_not_hot(width_px: float, photons: float, seed: int) -> None:
     """Half of them look like hot pixels: most neighbours are 0. 30 real ones are as bright as spots."""
