@@ -9,9 +9,11 @@ export PIP_BUILD_CONSTRAINT := $(CURDIR)/constraints.txt
 # Tests run in parallel: BLAS threads would only wait for each other.
 export OPENBLAS_NUM_THREADS := 1
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
+# Collecting the tests takes twice as long where their bytecode may not be kept.
+unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-all lint types unit optimised slow fuzz docs release bench bench-compare pins clean
+.PHONY: help demo test test-all lint types unit newest optimised slow durations fuzz docs release bench bench-compare pins clean
 
 help:  ## this list
 	@sed -n 's/^\([a-z-]*\):.*  ## \(.*\)/make \1\t\2/p' $(MAKEFILE_LIST) | expand -t 20
@@ -34,11 +36,21 @@ types: $(VENV)/installed
 unit: $(VENV)/installed
 	$(BIN)/python -m pytest -n 2 --dist worksteal -m "not slow"
 
+# What differs between versions of Python: imports, annotations, compilation, files, numbers at their edges.
+VERSIONED := tests/test_public.py tests/test_docstrings.py tests/base tests/slopes/kernels/test_compiling.py \
+	tests/slopes/camera tests/io/test_frame_formats.py tests/io/test_slope_files.py tests/test_estimators_hostile.py
+
+newest: $(VENV)/installed  ## the tenth of the fast tests that may differ between versions of Python
+	$(BIN)/python -m pytest -n 2 --dist worksteal -m "not slow" $(VERSIONED)
+
 optimised: $(VENV)/installed  ## inputs are checked without the assert statements that `python -O` leaves out
 	$(BIN)/python -O -m pytest -n 2 --dist worksteal -m "not slow" tests/base tests/loop/control/test_*.py
 
 slow: $(VENV)/installed  ## tests that start processes or a browser, or take longer
 	$(BIN)/python -m pytest -n 2 --dist worksteal -m slow
+
+durations: $(VENV)/installed  ## tests/durations.csv: processor seconds of each test and each compilation, cold and warm
+	$(BIN)/python -m tests.durations
 
 fuzz: $(VENV)/installed  ## hostile values at every entry point for MINUTES=60; a finding names its seed
 	$(BIN)/python -m tests.fuzz --minutes $(MINUTES)

@@ -35,6 +35,20 @@ settings.register_profile("random", settings.get_profile("default"), derandomize
 settings.register_profile("thorough", settings.get_profile("random"), max_examples=40 * USUAL_EXAMPLES)
 settings.load_profile("default")
 
+BASICS = ("test_public", "test_docstrings", "base/", "slopes/kernels/", "test_estimators.py")
+"""What runs first, so that a broken import, kernel or estimator shows at once."""
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Put the basic tests before the others."""
+
+    def rank(item: pytest.Item) -> int:
+        name = item.nodeid.removeprefix("tests/")
+        return next((number for number, start in enumerate(BASICS) if name.startswith(start)), len(BASICS))
+
+    items.sort(key=rank)
+
+
 # A shell's background job ignores Ctrl-C, and so would the programs that tests start and interrupt.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
