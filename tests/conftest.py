@@ -85,10 +85,11 @@ def coarse_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def undrawn_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Leave the figures of pages empty, and draw none: figures have tests of their own."""
+    """Leave the figures of pages empty, and draw none; take few draws of intervals: both have tests."""
     from matplotlib.figure import Figure
 
     from faintspot.base.report import page, plots
+    from faintspot.slopes.wavefront.certificate import certify
 
     def empty(
         kind: Any, /, name: str, title: str, caption: str, rows: Any, height: float, **options: Any
@@ -97,4 +98,5 @@ def undrawn_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
         return page.FigureWithData(name, title, caption, figure, plots.csv_of(rows))
 
     monkeypatch.setattr(page.FigureWithData, "of", classmethod(empty))
+    monkeypatch.setitem(certify.__kwdefaults__, "draws", 400)
     monkeypatch.setattr(Figure, "savefig", lambda figure, *places, **options: None)
