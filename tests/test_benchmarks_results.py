@@ -93,6 +93,7 @@ def test_nights_of_all_packages_are_what_the_documentation_shows(tmp_path: Path)
     assert stored["tables"]["nights"]["rows"] == [["soapy, 20 e-", "0.92, 0.91"]]
 
 
+@pytest.mark.slow
 def test_both_nights_stand_beside_the_papers_table(tmp_path: Path) -> None:
     (tmp_path / "paper.json").write_bytes((results.PAGES / "paper.json").read_bytes())
     nights = [night_with(seed, plan=NightPlan()) for seed in (1, 2)]

@@ -37,7 +37,7 @@ def on_unknown_background(case: Case, seed: int) -> Case:
 class TestAgainstOracle:
     @pytest.mark.parametrize("estimator", QUICK)
     @given(seed=SEEDS)
-    @examples(6)
+    @examples(4)
     def test_random_spots_equal_the_oracle(self, estimator: str, seed: int) -> None:
         case = random_case(seed, estimator)
         assert_equals_oracle(case, case.measure())
@@ -101,7 +101,7 @@ class TestAgainstOracle:
     def test_comparison_is_not_empty(self) -> None:
         """Most random spots are compared: less than a fifth is invalid or near a decision."""
         compared = total = 0
-        for seed in range(6):
+        for seed in range(3):
             case = random_case(seed, "ml", n=8)
             compared += assert_equals_oracle(case, case.measure())
             total += 8

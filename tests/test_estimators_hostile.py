@@ -19,7 +19,7 @@ from tests.estimator_cases import (
     with_noise_map,
     with_options,
 )
-from tests.patience import examples
+from tests.patience import examples, mostly_slow
 from tests.refusals import refused
 from tests.slopes.estimators.image_cases import KINDS, MAGNITUDES
 
@@ -146,7 +146,7 @@ class TestImages:
 class TestSettings:
     @EVERY
     @given(seed=SEEDS)
-    @examples(8)
+    @examples(4)
     def test_extreme_settings_give_sane_slopes(self, estimator: str, seed: int) -> None:
         rng = np.random.default_rng(seed)
         case = random_case(seed, estimator, n=6)
@@ -181,7 +181,7 @@ class TestSettings:
             assert_sane(case.measure(reference=np.tile(reference, (5, 1))))
 
     @EVERY
-    @pytest.mark.parametrize("number", [np.nan, 3e38, -3e38])
+    @pytest.mark.parametrize("number", mostly_slow(1, [np.nan, 3e38, -3e38]))
     def test_indices_stay_within_the_tables(self, estimator: str, number: float) -> None:
         """Whatever numbers come past the door: reading outside of the tables would end the process."""
         case = random_case(1, estimator, n=5, window=(8, 8))
@@ -192,7 +192,7 @@ class TestSettings:
             assert pipeline(case.images.reshape(-1, 8), case.prior).x.shape == (5,)
 
     @EVERY
-    @pytest.mark.parametrize("number", [np.nan, 1e6])
+    @pytest.mark.parametrize("number", mostly_slow(1, [np.nan, 1e6]))
     def test_a_prior_that_no_frame_can_hold_counts_as_none(self, estimator: str, number: float) -> None:
         """For the sub-apertures that have it; a loop that diverges must not stop the camera."""
         case = random_case(4, estimator, n=6)
@@ -201,7 +201,7 @@ class TestSettings:
         expected = replace(case, prior=np.where(np.abs(prior) < 1, prior, 0.0)).measure()
         assert_same(replace(case, prior=prior).measure(), expected)
 
-    @pytest.mark.parametrize("estimator", FITTED)
+    @pytest.mark.parametrize("estimator", mostly_slow(1, FITTED))
     @pytest.mark.parametrize("nodes", [5, 41])
     def test_small_and_odd_psfs(self, estimator: str, nodes: int) -> None:
         """Smaller than a pixel's reach, one-sided, or with negative parts."""

@@ -110,6 +110,7 @@ def test_command_that_flattens(run: Commands, slopes: Path, coarse_pictures: Non
     assert Path("c.png").exists()
 
 
+@pytest.mark.slow
 def test_difference_of_two_recordings(run: Commands, slopes: Path, no_picture: None) -> None:
     asked = ("--modes", 2, "-o", "w.json")
     run.ok("wavefront", slopes, "--minus", slopes, *asked)

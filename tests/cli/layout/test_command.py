@@ -329,6 +329,7 @@ def shown(run: Commands) -> NDArray[np.float64]:
     return np.array([x[column == number].mean() for number in range(11)])
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("only_found")
 def test_a_stated_pitch_keeps_the_defocus_of_the_frame(folder: Path, run: Commands) -> None:
     np.save("a.npy", defocused())
@@ -347,6 +348,7 @@ def test_a_stated_pitch_keeps_the_defocus_of_the_frame(folder: Path, run: Comman
     np.testing.assert_allclose(shown(run), wanted + 1.0, atol=0.05)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("only_found")
 def test_what_was_estimated_is_estimated_again_and_what_is_stated_stays(folder: Path, run: Commands) -> None:
     """Dark level and noise, so that slopes have standard errors; the noise stated first, then estimated."""

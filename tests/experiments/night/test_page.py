@@ -14,6 +14,7 @@ pytest.importorskip("zarr")
 pytestmark = pytest.mark.usefixtures("undrawn_pictures")
 
 
+@pytest.mark.slow
 def test_summary_and_page(tmp_path: Path) -> None:
     night = night_with(1, effect=0.2)
     written = write_night(night, tmp_path)

@@ -86,6 +86,7 @@ def test_a_star_that_is_too_faint_is_called_so() -> None:
     assert "too faint" in " ".join(answer_text.recommendation(answer))
 
 
+@pytest.mark.slow
 def test_the_limit_is_sought_beyond_the_plot() -> None:
     answer = answered(budget="0.02")
     limit = answer.best.limiting_flux_e

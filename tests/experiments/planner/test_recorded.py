@@ -129,6 +129,7 @@ def test_a_single_frame_does_not_tell_the_gain() -> None:
         question_from_frames(frames[0], darks[:, :10], layout=LAYOUT)
 
 
+@pytest.mark.slow
 def test_flux_that_differs_between_subapertures_is_simulated_so() -> None:
     rng = np.random.default_rng(6)
     flux = np.where(np.arange(36) % 2, 500.0, 1500.0)

@@ -79,6 +79,7 @@ def test_realisations_and_seeds_differ_and_repeat() -> None:
         assert abs(np.corrcoef(wavefronts[0].ravel(), other.ravel())[0, 1]) < 0.95
 
 
+@pytest.mark.slow
 def test_r0_drifts_between_its_ends() -> None:
     atmosphere = make_atmosphere(quiet().replace("atmosphere", r0_m=(0.08, 0.2), drift_time_s=10.0), 3)
     r0 = [atmosphere.r0_m(time) for time in np.linspace(0, 10, 400)]

@@ -126,6 +126,7 @@ def test_noise_free_loop_lies_between_fitting_error_and_its_budget() -> None:
     assert record.mean_strehl() == pytest.approx(marechal, abs=0.02)
 
 
+@pytest.mark.slow
 def test_open_loop_control() -> None:
     loop = load_loop("open_loop").replace("run", frames=50, settle_frames=25)
     settings = fs.Settings("brightest", keep_brightest=150)

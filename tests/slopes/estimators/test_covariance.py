@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tests.patience import mostly_slow
 
 import faintspot as fs
 
@@ -39,7 +40,7 @@ def distances(slopes: fs.Slopes, truth: Any) -> Any:
 
 
 @pytest.mark.parametrize("flux", [120.0, 1000.0])
-@pytest.mark.parametrize("name", ["ml", "map", "filter", "shape"])
+@pytest.mark.parametrize("name", mostly_slow(1, ["ml", "map", "filter", "shape"]))
 def test_ellipses_hold_95_percent(name: str, flux: float) -> None:
     """Within 2 %: the scatter of 3600 spots is 0.4 %; the rest is what a normal distribution neglects."""
     frames, truth = fs.slopes.simulate.sensor_frames(

@@ -12,6 +12,7 @@ from faintspot.slopes.sensor.drawing import layout_picture
 from faintspot.slopes.sensor.layout import Layout
 
 
+@pytest.mark.usefixtures("coarse_pictures")
 def test_layout_picture_is_a_png(tmp_path: Path) -> None:
     layout = sensor()
     frames = simulated(layout, 2)[0]

@@ -82,11 +82,11 @@ def test_weights_equal_a_sum_over_the_pixels(learnt: fs.FixedWeights) -> None:
 
 def test_stated_errors_are_those_of_the_slopes(learnt: fs.FixedWeights) -> None:
     """Of a spot at the mean position, for which they are meant."""
-    clean = np.repeat(spots(np.zeros((1, 2)), shape=(SIDE, SIDE), profile="gaussian", size=1.0), 20_000, 0)
+    clean = np.repeat(spots(np.zeros((1, 2)), shape=(SIDE, SIDE), profile="gaussian", size=1.0), 6000, 0)
     noisy = fs.slopes.simulate.Detector(NOISE_E).expose(FLUX_E * clean, np.random.default_rng(2))
     found = measure_images(noisy, window(2.0), calibration=fs.Calibration(read_noise_e=NOISE_E), score=learnt)
-    # 20,000 slopes: 0.5 %; the mean spot of the training is wider than one spot.
-    assert found.x.std() == pytest.approx(float(found.standard_error_x[0]), rel=0.03)
+    # 6000 slopes: 0.9 %; the mean spot of the training is wider than one spot.
+    assert found.x.std() == pytest.approx(float(found.standard_error_x[0]), rel=0.04)
 
 
 def test_without_known_flux_the_frame_says_it() -> None:

@@ -137,6 +137,7 @@ def same_kernels(theirs: NDArray[np.float64], sky: fs.LaserGuideStar, profile: f
     assert np.sqrt(away.max()) < 0.03
 
 
+@pytest.mark.slow
 def test_kernels_are_those_of_specula() -> None:
     specula = pytest.importorskip("specula")
     specula.init(-1, precision=1)  # before any other import of it

@@ -119,7 +119,7 @@ def test_psf_is_learnt_from_multiplied_electrons() -> None:
 
 
 def static(rng: Any, spread_px: Any) -> Any:
-    positions = 0.3 + spread_px * rng.uniform(-1, 1, (400, 2))
+    positions = 0.3 + spread_px * rng.uniform(-1, 1, (200, 2))
     images = rng.poisson(true_psf("gaussian").images(positions, (16, 16), 1000.0).clip(0))
     return images.astype(np.float32)
 

@@ -17,7 +17,7 @@ DARK = [0, 14, 21]
 USED = ~np.isin(np.arange(len(LAYOUT)), DARK)
 
 
-def frames(flux_e: float = 300.0, n: int = 40) -> NDArray[np.float32]:
+def frames(flux_e: float = 300.0, n: int = 20) -> NDArray[np.float32]:
     """Frames whose sub-apertures `DARK` have no spot."""
     images, _ = sensor_frames(
         LAYOUT,

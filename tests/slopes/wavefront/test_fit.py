@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from tests.patience import mostly_slow
 
 from faintspot import InputError, Layout, Settings, SlopePipeline, Slopes, SubapertureFlag, fit_wavefront
 from faintspot.slopes.sensor.pupil import inside_pupil, lenslet_outlines, lit_outlines, pupil_of, side_m
@@ -228,7 +229,7 @@ def test_slopes_count_by_their_standard_errors() -> None:
     assert (found.coefficients.std(axis=0) < 0.2 * plain.coefficients.std(axis=0)).all()
 
 
-@pytest.mark.parametrize("frames", [1, 6])
+@pytest.mark.parametrize("frames", mostly_slow(1, [1, 6]))
 def test_errors_count_what_no_mode_explains(frames: int) -> None:
     """Spots that are off by 0.3 px in every frame, with stated errors of 0.01 px: errors are those of 0.3 px.
 

@@ -81,6 +81,7 @@ def test_a_modal_loop_of_slopes_in_any_order() -> None:
     assert driven(control, new, matrix, 8) < 0.9 * driven(Integrator(matrix), new, matrix, 8)
 
 
+@pytest.mark.slow
 def test_the_fallback_of_modes_is_the_recorded_integrator() -> None:
     """Although the replay advises less than its gain of 1.1."""
     rng = np.random.default_rng(14)
