@@ -13,6 +13,7 @@ from tests.io.slope_files import (
     assert_refused,
     begin,
     result,
+    store_of,
     write,
     writer_for,
 )
@@ -175,3 +176,11 @@ class TestWithoutZarr:
     def test_more_than_fits_in_memory(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(file_format, "memory_bytes", lambda: 20_000)
         assert_refused(tmp_path / "slopes.npz", "of memory, expected slopes of at most")
+
+
+def test_a_resumed_run_that_is_killed_has_lost_nothing(tmp_path: Path) -> None:
+    """Frames of a chunk that was not full stay on the disk until it is written again."""
+    begin(tmp_path / "slopes.npz", 13)
+    with writer_for(tmp_path / "slopes.npz") as writer:
+        assert writer.finished() == 13
+        assert read_slopes(store_of(tmp_path / "slopes.npz")).n_finished == 13

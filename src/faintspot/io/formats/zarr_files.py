@@ -99,7 +99,6 @@ class SlopeStore:
         incomplete_chunk = {
             name: read_items(self.path, array, start, n_stored) for name, array in self._arrays.items()
         }
-        self.mark(start)
         return start, [incomplete_chunk]
 
     def mark(self, finished: int) -> None:
@@ -113,11 +112,16 @@ class SlopeStore:
         self.marked = finished
 
     def write(self, start: int, variables: Mapping[str, NDArray[np.generic]]) -> None:
-        """Store whole chunks."""
+        """Store whole chunks; one that was incomplete is marked again as soon as it is written."""
+        again = self.marked > start
+        if again:
+            self.mark(start)
         for name, values in variables.items():
             array = self._arrays[name]
             array[start : start + len(values)] = values
             self._not_synchronised.update(chunk_files(self.path, array, start, start + len(values)))
+        if again:
+            self.mark(start + len(variables["x"]))
 
     def variables(self) -> Any:
         """Return the variables, each read in parts from the store."""
