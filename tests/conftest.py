@@ -88,6 +88,7 @@ def undrawn_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
     """Leave the figures of pages empty, and draw none; take few draws of intervals: both have tests."""
     from matplotlib.figure import Figure
 
+    from faintspot.base.checks import not_none
     from faintspot.base.report import page, plots
     from faintspot.slopes.wavefront.certificate import certify
 
@@ -98,5 +99,5 @@ def undrawn_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
         return page.FigureWithData(name, title, caption, figure, plots.csv_of(rows))
 
     monkeypatch.setattr(page.FigureWithData, "of", classmethod(empty))
-    monkeypatch.setitem(certify.__kwdefaults__, "draws", 400)
+    monkeypatch.setitem(not_none(certify.__kwdefaults__), "draws", 400)
     monkeypatch.setattr(Figure, "savefig", lambda figure, *places, **options: None)

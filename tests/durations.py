@@ -12,7 +12,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -70,9 +70,9 @@ def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
         _write("test", item.nodeid.partition("[")[0], _seconds() - start)
 
 
-def _run(caches: Path, chosen: list[str]) -> tuple[Counter[tuple[str, str]], Counter[tuple[str, str]]]:
+def _run(caches: Path, chosen: list[str]) -> tuple[dict[tuple[str, str], float], Counter[tuple[str, str]]]:
     """Return the seconds and the number of each kind and name of one run of the tests."""
-    seconds, number = Counter[tuple[str, str]](), Counter[tuple[str, str]]()
+    seconds, number = defaultdict[tuple[str, str], float](float), Counter[tuple[str, str]]()
     with tempfile.TemporaryDirectory() as folder:
         surroundings = {**os.environ, _FOLDER: folder, "NUMBA_CACHE_DIR": str(caches)}
         surroundings.pop("PYTHONDONTWRITEBYTECODE", None)
