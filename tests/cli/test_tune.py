@@ -68,6 +68,7 @@ def test_calibration_of_an_existing_configuration_counts_and_stays(run: Commands
     )
 
 
+@pytest.mark.slow
 def test_tuning_in_binned_pixels(run: Commands, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     layout = Layout.grid((4, 4), pixels=16, bin=2, frame_shape=(65, 65))

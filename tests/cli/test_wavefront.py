@@ -138,6 +138,7 @@ def test_difference_of_two_recordings(run: Commands, slopes: Path, no_picture: N
         assert means == pytest.approx([mode["mean"] for mode in moved["modes"]], abs=0.02)
 
 
+@pytest.mark.slow
 def test_displaced_source_is_a_tilt(run: Commands, slopes: Path, no_picture: None) -> None:
     """Of a reference displaced by a part of a pitch, which leaves a column of lenslets without light."""
     layout = replace(Layout.grid((4, 4), pixels=8), fitted=("centre",))

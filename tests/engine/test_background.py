@@ -137,6 +137,7 @@ def test_a_learnt_centroid_gain(name: str, model: Kalman) -> None:
         each.ring.close()
 
 
+@pytest.mark.slow
 def test_a_better_filter_is_handed_to_the_engine(
     name: str, model: Kalman, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -12,6 +12,7 @@ from faintspot.engine.child_processes import real_time
 pytestmark = pytest.mark.skipif(not hasattr(os, "sched_setscheduler"), reason="Linux only")
 
 
+@pytest.mark.slow
 def test_priority_holds_for_threads_that_were_there_before_and_is_given_back() -> None:
     done = threading.Event()
     thread = threading.Thread(target=done.wait)

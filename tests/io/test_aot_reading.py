@@ -158,6 +158,7 @@ def with_subapertures(system: Any) -> None:
         system.wavefront_sensors[0].detector.pixel_intensities.data[:, row, column] += 1000.0
 
 
+@pytest.mark.slow
 def test_the_example_of_aotpy(tmp_path: Path) -> None:
     sensor: Any = read_aot(example(tmp_path / "e.fits"))  # that with pixels
     assert (sensor.name, sensor.n, sensor.pixels) == ("WFS1", 4, "PIXELS")

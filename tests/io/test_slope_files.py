@@ -92,6 +92,7 @@ def test_csv_is_a_plain_table(tmp_path: Path) -> None:
     assert lines[1 + 7 + 2].startswith("1,2,0.1,")
 
 
+@pytest.mark.slow
 def test_csv_is_written_in_pieces(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """As texts the whole table of 1,500 lines takes 1.3 MB, with a piece of 128 lines 0.35 MB."""
     monkeypatch.setattr(csv_files, "_LINES", 128)

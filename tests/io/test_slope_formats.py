@@ -24,6 +24,7 @@ from tests.io.slope_files import (
     write,
     writer_for,
 )
+from tests.patience import mostly_slow
 from tests.refusals import refused
 
 from faintspot.base import files
@@ -57,16 +58,18 @@ def all_marks(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(slopes_writer, "_MARK_SECONDS", 0.0)
 
 
+@pytest.mark.parametrize("name", NAMES)
+def test_gives_back_what_it_got(tmp_path: Path, name: str) -> None:
+    write(tmp_path / name, result(), 8)
+    assert_alone(tmp_path / name, result())
+
+
 class TestEveryFormat:
-    @pytest.fixture(params=NAMES)
+    @pytest.fixture(params=mostly_slow(2, NAMES))
     def name(self, request: pytest.FixtureRequest) -> str:
         return str(request.param)
 
     # Content ----------------------------------------------------------------------------------------
-
-    def test_gives_back_what_it_got(self, path: Path) -> None:
-        write(path, result(), 8)
-        assert_alone(path, result())
 
     def test_equal_slopes_give_equal_files(self, path: Path, is_store: bool) -> None:
         if is_store:

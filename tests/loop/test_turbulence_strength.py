@@ -4,6 +4,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from tests.loop.control.frozen_flow import frozen_slopes
+from tests.patience import mostly_slow
 
 from faintspot.loop.slope_covariance import ARCSEC, SlopeTurbulence
 from faintspot.loop.turbulence_strength import (
@@ -91,7 +92,7 @@ def site(r0_m: float, outer_scale_m: float = 25.0) -> SlopeTurbulence:
     )
 
 
-@pytest.mark.parametrize("r0_m", [0.08, 0.25])
+@pytest.mark.parametrize("r0_m", mostly_slow(1, [0.08, 0.25]))
 @pytest.mark.parametrize("outer_scale_m", [25.0, 100.0])
 def test_r0_of_independent_frames_with_noise_and_vibration(r0_m: float, outer_scale_m: float) -> None:
     """Within 7 %: squares are taken for discs (1 %), an outer scale of 25 m adds 4 %, 2000 frames scatter."""

@@ -45,7 +45,7 @@ def is_png(path: Path) -> bool:
     return content.startswith(b"\x89PNG\r\n") and len(content) > 5000
 
 
-@pytest.mark.parametrize("geometry", ["square", "hexagonal"])
+@pytest.mark.parametrize("geometry", mostly_slow(1, ["square", "hexagonal"]))
 def test_simulated_frames_give_their_lattice(folder: Path, run: Commands, geometry: str) -> None:
     """Lattice points within 0.2 px: 3 frames of 49 spots leave 0.01 px, the fit of a common grid less."""
     np.save("a.npy", frames(geometry))
@@ -68,6 +68,7 @@ def test_simulated_frames_give_their_lattice(folder: Path, run: Commands, geomet
     assert np.abs(stored.variables["x"]).mean() < 0.2
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("only_found")
 def test_slopes_do_not_depend_on_the_unit_of_the_frames(folder: Path, run: Commands) -> None:
     found, settings = [], []
@@ -97,6 +98,7 @@ def test_options_are_used_or_refused(folder: Path, run: Commands) -> None:
     assert "slopes 'a b.npz' --key night --config" in result.out
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("no_trials")
 def test_one_line_names_what_cannot_be_used(folder: Path, run: Commands) -> None:
     raw = frames(n_frames=1)[0].round().astype("<u2") + 200
@@ -175,6 +177,7 @@ def test_dark_frames_give_the_noise_of_each_pixel(folder: Path, run: Commands) -
     assert Calibration.load("number.toml").read_noise_e == 3.0
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("only_found")
 def test_maps_of_the_camera(folder: Path, run: Commands) -> None:
     """A cube of darks is averaged, a flat divided by its mean, bad pixels come as a map or a list."""
@@ -202,6 +205,7 @@ def test_maps_of_the_camera(folder: Path, run: Commands) -> None:
     assert np.asarray(Calibration.load("other.toml").bad_pixels).tolist() == [[3, 5], [40, 41]]
 
 
+@pytest.mark.slow
 @DOUBTS
 @pytest.mark.usefixtures("only_found")
 def test_pixels_exclude_pupil_and_roi_choose_lenslets(folder: Path, run: Commands) -> None:

@@ -41,6 +41,7 @@ def test_reflection_spoils_no_settings_and_slopes(folder: Path, run: Commands, r
     assert np.hypot(*errors[slopes.valid].T).max() < 1.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", mostly_slow(1, [1, 2]))
 def test_defaults_in_eyes(folder: Path, run: Commands, seed: int) -> None:
     """Scaled median deviations, of narrow centroids 0.57 px: a few lenslets have reflections for spots."""
@@ -58,6 +59,7 @@ def test_defaults_in_eyes(folder: Path, run: Commands, seed: int) -> None:
     assert 1.4826 * np.median(np.abs(errors[judged])) < 0.57
 
 
+@pytest.mark.slow
 def test_background_beyond_a_stated_dark_is_reported(folder: Path, run: Commands) -> None:
     """The dark stays as stated, and the width does not follow the reflection."""
     np.save("a.npy", flat_frame(500.0).pixels)
@@ -96,6 +98,7 @@ def test_flat_field_corrects_a_colour_mosaic(folder: Path, run: Commands) -> Non
     run.ok("layout", "a.npy", "-o", "new.toml", "--dark", "100", "--flat", "flat.npy")
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("no_trials")
 @pytest.mark.parametrize("kind", mostly_slow(1, ["offset", "pattern", "with light"]))
 def test_a_dark_never_makes_a_layout_worse(folder: Path, run: Commands, kind: str) -> None:

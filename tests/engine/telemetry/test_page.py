@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from tests.patience import mostly_slow
 from tests.slopes.recorded.recorded_cases import Page
 
 from faintspot.base.errors import InputError
@@ -113,7 +114,7 @@ def test_the_page_has_every_part_and_the_numbers_of_each_method(path: Path) -> N
     assert noise == pytest.approx([RMS_PX[0], RMS_PX[1]], rel=0.05)
 
 
-@pytest.mark.parametrize("n_frames", [1, 7, 99])
+@pytest.mark.parametrize("n_frames", mostly_slow(1, [1, 7, 99]))
 def test_latencies_of_a_short_record_are_drawn(path: Path, n_frames: int) -> None:
     night = read_telemetry(path)
     arrays = {f.name: getattr(night, f.name) for f in fields(night)}

@@ -112,7 +112,7 @@ def test_the_limiting_magnitude_lies_between_points() -> None:
     assert _crossed([8, 9], [0.3, 0.2], 0.4) == -math.inf
 
 
-@pytest.mark.parametrize("apart", [0.5, 1.0, 1.5])
+@pytest.mark.parametrize("apart", mostly_slow(1, [0.5, 1.0, 1.5]))
 def test_limits_of_curves_that_bend_hold_within_their_errors(apart: float) -> None:
     """A third of the error of straight lines, which is the error that is stated."""
     wrong, stated, straight = [], [], []

@@ -177,6 +177,7 @@ def test_conditions_make_sets(tmp_path: Path) -> None:
     assert recorded_night(tmp_path / "night.zarr", settle_frames=5).settle_frames == (5, 5)
 
 
+@pytest.mark.slow
 def test_slopes_that_lean_on_a_prediction(tmp_path: Path) -> None:
     path = stored(tmp_path, alternating(6000, 150), ("map+integrator", "map+kalman"))
     recorded = recorded_night(path)

@@ -28,6 +28,7 @@ PLAN = NightPlan(
 LOOP = small().replace("atmosphere", r0_m=(0.1, 0.2), drift_time_s=2.0).replace("camera", em_gain=100.0)
 
 
+@pytest.mark.slow
 def test_a_night_is_what_the_loop_does(tmp_path: Path) -> None:
     night = run_night(LOOP, tmp_path, plan=PLAN, pool=HERE)
     assert len(night.strehl) == 2 * 3 + 4

@@ -84,6 +84,7 @@ def test_a_smaller_gain_than_claimed_holds_in_part(number: int) -> None:
     assert outcome(number, verdicts_of(1.2)) is FAILS
 
 
+@pytest.mark.slow
 def test_dependence_on_k_is_measured_in_best_k_and_over_the_fixed_ones() -> None:
     flat, steep = (
         (lambda method: 0.5 if method == "brightest" else 0.1),

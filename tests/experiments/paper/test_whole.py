@@ -41,6 +41,7 @@ def test_every_figure_and_the_night_are_there_in_order() -> None:
     assert all(row.number or row.verdict == NOT_MEASURED for row in rows)
 
 
+@pytest.mark.slow
 def test_a_night_alone() -> None:
     rows = paper_rows(None, night_with(1, effect=0.2, best=0.2))
     assert [row.verdict for row in rows] == [HOLDS] * 4 + [OPEN]

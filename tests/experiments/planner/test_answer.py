@@ -79,6 +79,7 @@ def test_the_recommendation_in_words() -> None:
     assert "assumed profile" in " ".join(answer_text.foundations(answer))
 
 
+@pytest.mark.slow
 def test_a_star_that_is_too_faint_is_called_so() -> None:
     answer = answered(read_noise_e=30.0, flux_e=20.0)
     assert answer.is_hopeless

@@ -106,6 +106,7 @@ def test_a_faint_recording_has_the_range_of_its_spots() -> None:
     assert any("the flux is too low" in fact for fact in dark.recorded.facts)
 
 
+@pytest.mark.slow
 def test_a_single_frame_is_not_checked() -> None:
     frames, _ = recorded(1)
     known: dict[str, Any] = {"layout": LAYOUT, "gain_e_per_adu": 0.5, "read_noise_e": 4.0, "fwhm_px": 1.77}
@@ -152,6 +153,7 @@ def test_unreliable_gain_is_not_used() -> None:
         question_from_frames(frames, layout=question.layout)
 
 
+@pytest.mark.slow
 def test_dark_subapertures_are_left_out_of_the_question_but_not_of_the_layout() -> None:
     lit = np.arange(36) != 7
     frames, _ = sensor_frames(LAYOUT, 12, flux_e=1000.0 * lit, detector=CAMERA, rng=np.random.default_rng(7))

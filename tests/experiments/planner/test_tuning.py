@@ -102,6 +102,7 @@ def test_speckled_spots_are_measured_without_trusting_their_mean() -> None:
     assert answer.best.statistics.corrected_rms.value < answer["brightest"].statistics.corrected_rms.value
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_answer() -> None:
     again = tune(Question(**CAMERA), rng=np.random.default_rng(1), **QUICK)
     for first, second in zip(answered().results, again.results, strict=True):
@@ -158,6 +159,7 @@ def test_only_a_question_is_answered() -> None:
         tune(Question(**CAMERA), realisations=3)
 
 
+@pytest.mark.slow
 def test_a_plugin_that_refuses_the_scene_is_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
     @dataclass(frozen=True, eq=False, kw_only=True)
     class Refusing(Estimator):

@@ -107,6 +107,7 @@ def test_standard_errors_are_right() -> None:
     assert 13.2 < chi_squared < 83.8
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name",
     [

@@ -74,6 +74,7 @@ def test_interrupted_and_started_again(tmp_path: Path, uninterrupted: Path) -> N
     assert len(counts) == N_CELLS - 4 + 1  # a complete study tells nothing
 
 
+@pytest.mark.slow
 def test_other_cells_do_not_matter(uninterrupted: Path) -> None:
     whole = experiments.open_study(uninterrupted)
     sweep = Sweep("one", flux_e=[300, 30], pixels=8)

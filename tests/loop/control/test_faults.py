@@ -86,7 +86,7 @@ def test_sub_apertures_with_the_same_slopes_and_rows_of_zero() -> None:
     assert not followers(loop.slopes).any()
 
 
-@pytest.mark.parametrize("delay", [1, 3])
+@pytest.mark.parametrize("delay", mostly_slow(1, [1, 3]))
 def test_no_sub_aperture_of_a_sound_loop_is_silent(delay: int) -> None:
     loop = recorded(delay, 0.6, frames=900)
     assert np.isfinite(prepared(loop).recording.slopes).all()

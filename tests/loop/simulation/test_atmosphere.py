@@ -72,6 +72,7 @@ def test_it_goes_on_where_the_screen_ends() -> None:
     assert max(jumps) < 2 * np.median(jumps)
 
 
+@pytest.mark.slow
 def test_realisations_and_seeds_differ_and_repeat() -> None:
     wavefronts = [make_atmosphere(quiet(), *which).wavefront_nm(1.0) for which in ((1, 0), (1, 1), (2, 0))]
     np.testing.assert_array_equal(wavefronts[0], make_atmosphere(quiet(), 1, 0).wavefront_nm(1.0))

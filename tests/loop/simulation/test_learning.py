@@ -57,6 +57,7 @@ def test_never_below_the_integrator() -> None:
         assert strehl(_method(kind)) > plain - 0.015
 
 
+@pytest.mark.slow
 def test_the_filter_s_certainty_is_the_estimator_s_prior() -> None:
     method, learnt = learnt_control(FAINT, _method("kalman"), 1, simulate_loop)
     assert learnt is not None
@@ -87,6 +88,7 @@ def test_control_needs_a_closed_loop_and_the_whole_run() -> None:
         _method("pid")
 
 
+@pytest.mark.slow
 def test_true_slopes_have_no_prior() -> None:
     short = FAINT.replace("run", frames=60, settle_frames=20)
     record = simulate_loop(short, [replace(_method("kalman"), variants=("true",))])

@@ -55,6 +55,7 @@ def test_methods_see_the_same_atmosphere_and_photons(record: LoopRecord) -> None
     assert mixed.labels == ("plain", "tv")
 
 
+@pytest.mark.slow
 def test_a_run_goes_on_where_another_ended() -> None:
     loop = faint().replace("control", mode="open")
     whole, end = (loop.replace("run", frames=frames, settle_frames=1) for frames in (12, 5))
@@ -70,6 +71,7 @@ def test_a_run_goes_on_where_another_ended() -> None:
             simulate_loop(end, [plain()], first_frame=wrong)
 
 
+@pytest.mark.slow
 def test_the_static_error_lowers_strehl_ratios_alone() -> None:
     loop = faint().replace("run", frames=8, settle_frames=1)
     record = simulate_loop(loop, [plain()])

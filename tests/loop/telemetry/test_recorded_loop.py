@@ -98,7 +98,7 @@ def test_control_matrix_and_mask(tmp_path: Path) -> None:
     assert loop.pixel_scale_arcsec == 1.0
 
 
-@pytest.mark.parametrize("closed", [True, False])
+@pytest.mark.parametrize("closed", mostly_slow(1, [True, False]))
 def test_what_is_written_as_aot_is_read_as_from_the_store(tmp_path: Path, closed: bool) -> None:
     pytest.importorskip("aotpy")
     scales = {"pixel_scale_arcsec": 0.3, "subaperture_m": 0.5, "diameter_m": 1.6}
@@ -330,6 +330,7 @@ def test_a_question_at_a_time(tmp_path: Path) -> None:
         assert option in unknown
 
 
+@pytest.mark.slow
 def test_tip_tilt_of_keck(tmp_path: Path) -> None:
     """Commands are in the axes and the unit of the slopes; the loop is one aperture."""
     rng = np.random.default_rng(2)

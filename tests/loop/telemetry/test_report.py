@@ -224,6 +224,7 @@ def test_without_commands_turbulence_is_missing() -> None:
     assert not report.choices
 
 
+@pytest.mark.slow
 def test_open_loop_has_noise_and_no_delay() -> None:
     """An open loop has no delay; its turbulence is known all the same."""
     loop: Any = recorded()
@@ -247,6 +248,7 @@ def test_few_frames_are_too_few_for_noise_and_turbulence() -> None:
     assert all("48 frames" in report.parts[name].missing for name in ("noise", "turbulence", "choices"))
 
 
+@pytest.mark.slow
 def test_large_slopes_not_measured() -> None:
     """Without the largest third of the slopes the others tell no turbulence."""
     loop: Any = recorded()

@@ -102,6 +102,7 @@ def test_a_threshold_gives_the_same_at_every_width_bit_for_bit(side: int) -> Non
             np.testing.assert_array_equal(getattr(narrow, field), getattr(wide(frames), field))
 
 
+@pytest.mark.slow
 def test_the_slope_of_a_denoised_image_has_converged() -> None:
     """Where nearly all pixels are kept, 24 iterations leave 1.5 times the converged error: the shallow
     background converges last. Both errors are of the same images, so that 4 % are no matter of chance.

@@ -139,7 +139,7 @@ def array_of_wide_spots(fwhm_px: float, moved: NDArray[np.float64]) -> tuple[NDA
     return 5000 * y[:, :, None] * x[:, None, :], layout
 
 
-@pytest.mark.parametrize("fwhm_px", [6.0, 8.4])
+@pytest.mark.parametrize("fwhm_px", mostly_slow(1, [6.0, 8.4]))
 def test_spots_as_wide_as_their_neighbours_are_far(fwhm_px: float) -> None:
     """Systematic errors below 0.03 px up to 0.7 of the pitch, as the prediction says; the width is known."""
     rng = np.random.default_rng(1)
@@ -171,6 +171,7 @@ def test_spots_almost_as_wide_as_the_largest_window_have_settings() -> None:
     assert found.systematic_px < 0.03
 
 
+@pytest.mark.slow
 def test_spots_wider_than_their_pitch_are_doubtful() -> None:
     flat, layout = array_of_wide_spots(10.5, np.zeros((1, 2)))
     noise = np.random.default_rng(1).normal(0.0, 3.0, flat.shape)

@@ -35,6 +35,7 @@ def record(made: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     return made
 
 
+@pytest.mark.slow
 def test_the_command_follows(record: Recording, run: Commands) -> None:
     pytest.importorskip("zarr")
     run.ok("slopes", "frames.npy", "-o", "s.zarr", "--follow")
@@ -70,6 +71,7 @@ def test_resumed_it_is_the_same(record: Recording) -> None:
         measure_recorded(["frames.npy"], "faintspot.toml", "s.zarr")
 
 
+@pytest.mark.slow
 def test_the_report_has_the_paths(record: Recording) -> None:
     measure_recorded(["frames.npy"], "faintspot.toml", "s.npz", follow=True)
     report = report_of_stored(["s.npz"])

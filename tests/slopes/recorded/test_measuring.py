@@ -140,7 +140,7 @@ def test_frames_written_twice_are_counted(made: Recording) -> None:
     assert made.measure(block_frames=3).repeated_frames == 30
 
 
-@pytest.mark.parametrize("away", [-19.0, 400.0])
+@pytest.mark.parametrize("away", mostly_slow(1, [-19.0, 400.0]))
 def test_estimated_dark_of_other_frames_is_moved(made: Recording, away: float) -> None:
     """An estimated dark that does not fit gives the slopes of one that does; a stated one is named."""
     text = CONFIGURATION + "\n[calibration]\ndark = {}\n"

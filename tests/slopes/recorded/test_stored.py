@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tests.patience import mostly_slow
 from tests.refusals import refused
 from tests.slopes.recorded.recorded_cases import SETTINGS, Page, sensor, simulated
 
@@ -99,14 +100,21 @@ def test_stores_of_different_sensors_are_refused_in_one_line(tmp_path: Path) -> 
 
 @pytest.mark.parametrize(
     ("name", "changes", "words"),
-    [
-        ("s.csv", {}, ("does not say with which configuration", "median flux", "sub-apertures is not known")),
-        ("s.npz", {"configuration": "not [ toml"}, ("configuration stored in s.npz cannot be used",)),
-        ("s.npz", {"configuration": "[estimator]\nname = 'tv'\nnoise_std = -1\n"}, ("cannot be used",)),
-        ("s.npz", {"configuration": "[layout]\nwindow = [8, 8]\n"}, ("cannot be used",)),
-        ("s.npz", {"sources": ["gone.npy"]}, ("Not drawn: gone.npy",)),
-        ("s.npz", {"sources": None}, ("does not say where its frames came from",)),
-    ],
+    mostly_slow(
+        2,
+        [
+            (
+                "s.csv",
+                {},
+                ("does not say with which configuration", "median flux", "sub-apertures is not known"),
+            ),
+            ("s.npz", {"configuration": "not [ toml"}, ("configuration stored in s.npz cannot be used",)),
+            ("s.npz", {"configuration": "[estimator]\nname = 'tv'\nnoise_std = -1\n"}, ("cannot be used",)),
+            ("s.npz", {"configuration": "[layout]\nwindow = [8, 8]\n"}, ("cannot be used",)),
+            ("s.npz", {"sources": ["gone.npy"]}, ("Not drawn: gone.npy",)),
+            ("s.npz", {"sources": None}, ("does not say where its frames came from",)),
+        ],
+    ),
 )
 def test_what_is_not_known_is_said(
     tmp_path: Path, name: str, changes: dict[str, Any], words: tuple[str, ...]
@@ -155,7 +163,8 @@ def measured(folder: Path, name: str, **options: Any) -> Path:
 
 
 @pytest.mark.parametrize(
-    ("name", "options"), [("brightest", {}), ("thresholded", {"threshold_e": 0.5}), ("ml", {})]
+    ("name", "options"),
+    mostly_slow(1, [("brightest", {}), ("thresholded", {"threshold_e": 0.5}), ("ml", {})]),
 )
 def test_page_of_an_estimator_speaks_of_it_alone(tmp_path: Path, name: str, options: dict[str, Any]) -> None:
     text = Page(report_of_stored([measured(tmp_path, name, **options)])).text

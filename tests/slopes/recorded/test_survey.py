@@ -49,6 +49,7 @@ def movie(shift_px: float) -> np.ndarray:
     return images.reshape(FRAMES, N * SIDE, SIDE).astype(np.float32)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("width_px", mostly_slow(1, [2.5, 5.0]))
 def test_response_of_moving_speckled_spots(width_px: float) -> None:
     """Within 4 % of what a displacement of all frames shows: its finite step, and speckles that differ."""

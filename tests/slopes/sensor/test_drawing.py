@@ -26,6 +26,7 @@ def test_layout_picture_is_a_png(tmp_path: Path) -> None:
         layout_picture(frames, layout, tmp_path / "none" / "layout.png")
 
 
+@pytest.mark.slow
 def test_layout_picture_of_a_real_frame(tmp_path: Path) -> None:
     frame = np.load(shared_file("data/ciao_bench_60x224x224.npz"))["frames"].mean(axis=0)
     layout = Layout.grid((8, 8), pixels=27, frame_shape=frame.shape)

@@ -51,7 +51,7 @@ def half_width(cut: NDArray[np.float64]) -> float:
     return float(2 * (below - 1 + (right[below - 1] - right[0] / 2) / (right[below - 1] - right[below])))
 
 
-@pytest.mark.parametrize("size", [0.25, 0.5, 1.0, 1.5, 3.0])
+@pytest.mark.parametrize("size", mostly_slow(1, [0.25, 0.5, 1.0, 1.5, 3.0]))
 def test_without_turbulence_the_spots_are_those_of_the_lenslet(size: float) -> None:
     images, truth = speckled_spots(
         40, d_over_r0=0.0, size=size, position_range_px=4.0, flux_e=30.0, rng=np.random.default_rng(1)

@@ -64,6 +64,7 @@ def test_separable_spots_get_a_separable_psf_and_others_do_not() -> None:
         assert slope_error(learnt.psf, fresh, positions, 1.0) < 1.05 * best
 
 
+@pytest.mark.slow
 def test_a_background_does_not_enter_the_wings() -> None:
     rng = np.random.default_rng(7)
     psf = true_psf("gaussian")
@@ -97,6 +98,7 @@ def test_each_subaperture_can_have_its_own_psf() -> None:
     assert len(one.samples) == 1
 
 
+@pytest.mark.slow
 def test_the_read_noise_is_measured_and_the_start_may_be_given() -> None:
     rng = np.random.default_rng(9)
     psf = true_psf("gaussian")
@@ -107,6 +109,7 @@ def test_the_read_noise_is_measured_and_the_start_may_be_given() -> None:
         assert learnt.psf.samples.shape == (1, 25, 25)
 
 
+@pytest.mark.slow
 def test_psf_is_learnt_from_multiplied_electrons() -> None:
     rng = np.random.default_rng(10)
     psf = true_psf("gaussian")

@@ -44,6 +44,7 @@ def test_nothing_but_bad_pixels() -> None:
         usable_subapertures(np.full((2, *LAYOUT.frame_shape), np.nan), LAYOUT, CAMERA)
 
 
+@pytest.mark.slow
 def test_psf_is_that_of_the_others() -> None:
     """Bit for bit, and dark sub-apertures get one of the PSFs."""
     kinds = np.arange(len(LAYOUT)) % 2

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.stats import linregress
+from tests.patience import mostly_slow
 from tests.slopes.wavefront.test_fit import LAYOUT, SCALED, slopes_of, slopes_of_modes
 
 from faintspot import InputError, Layout, Wavefront, fit_wavefront
@@ -42,6 +43,7 @@ def test_sizes_of_a_wavefront_without_noise() -> None:
     assert found.strehl.low < strehl < found.strehl.high
 
 
+@pytest.mark.slow
 def test_error_of_the_radius_of_curvature_is_its_scatter() -> None:
     """Over 60 measurements, whose scatter is known to 9 %; three standard errors of that."""
     defocus = np.array([noisy(SCALED, TRUE, 0.05, seed).mean[2] for seed in range(60)])
@@ -59,7 +61,7 @@ def test_sizes_are_those_of_the_lit_part() -> None:
     assert found.rms.value == pytest.approx(radius * 2 * np.sqrt(3) * 0.75 / np.sqrt(12), rel=0.1)
 
 
-@pytest.mark.parametrize(("frames", "reference"), [(1, 0), (3, 6)])
+@pytest.mark.parametrize(("frames", "reference"), mostly_slow(1, [(1, 0), (3, 6)]))
 def test_rms_intervals_hold(frames: int, reference: int) -> None:
     """Sizes from 0 to far above the noise: of 40 intervals, 5 misses or fewer have a probability of 99 %."""
     held, errors = [], []

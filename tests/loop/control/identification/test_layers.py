@@ -106,6 +106,7 @@ def test_turbulence_that_stands_still() -> None:
     assert np.hypot(*found.turbulence.wind_m_per_s.T).max() < 4.0
 
 
+@pytest.mark.slow
 def test_known_winds_have_their_strengths() -> None:
     identification = Identification(observed(frames=500), UNKNOWN, RATE_HZ)
     found = identification.of_winds(AIR.wind_m_per_s)

@@ -39,6 +39,7 @@ def test_gain_of_a_known_delay() -> None:
     assert found.gain == pytest.approx(0.5, rel=0.2)
 
 
+@pytest.mark.slow
 def test_gain_of_a_bright_sensor_that_sees_fine_turbulence() -> None:
     """Structure too fine for the mirror, in the slopes alone, up to 50 Hz."""
     rng = np.random.default_rng(12)

@@ -65,6 +65,7 @@ def test_tip_and_tilt_are_better_than_with_the_integrator(tip_tilt: PredictiveCo
     assert "an integrator of gain 0.4 ran" in tip_tilt.summary()
 
 
+@pytest.mark.slow
 def test_a_modal_loop_of_slopes_in_any_order() -> None:
     """Five modes in 41 slopes, of which one is constant and one is missing half of the time."""
     rng = np.random.default_rng(6)

@@ -49,6 +49,7 @@ def test_from_a_file_it_is_the_same(learnt: Kalman, tmp_path: Path) -> None:
     np.testing.assert_allclose(engines, sent[0], rtol=0, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_it_goes_on_from_what_the_mirror_holds(learnt: Kalman) -> None:
     """Slopes of a mirror that takes off all there is: the next command is nearly the same."""
     line = CommandDelayLine(12, 2)

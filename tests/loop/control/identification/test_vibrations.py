@@ -28,7 +28,7 @@ def _seen(seed: int, *moving: Vibration) -> NDArray[np.float64]:
     return amplitudes
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", mostly_slow(1, range(4)))
 def test_a_broad_maximum_is_no_vibration(seed: int) -> None:
     assert find_vibrations(_seen(seed, BUMP), _RATE_HZ, _SLOPES) == ()
 

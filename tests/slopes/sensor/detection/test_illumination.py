@@ -105,6 +105,7 @@ def test_ghosts_are_left_out(seed: int) -> None:
     assert false == 0
 
 
+@pytest.mark.slow
 def test_faint_spots_are_doubtful() -> None:
     faint = Sensor(1, lenslets=16, flux_e=100.0)
     grid = find_lenslets(faint.frame())

@@ -13,7 +13,7 @@ from faintspot.base.errors import InputError
 from faintspot.slopes.sensor.detection.lenslets import find_lenslets
 
 
-@pytest.mark.parametrize("geometry", ["square", "hexagonal"])
+@pytest.mark.parametrize("geometry", mostly_slow(1, ["square", "hexagonal"]))
 def test_five_sigma_spots(geometry: str) -> None:
     # Noise of a background of 35 and 3 of read noise: 6.6; 5 of them in a Gaussian matched filter.
     flux_e = 5 * 6.6 * np.sqrt(4 * np.pi) * 1.3
