@@ -74,6 +74,15 @@ class TestValues:
         np.testing.assert_array_equal(stored, values)
 
 
+def test_a_primary_image_of_one_number_is_not_the_frames(tmp_path: Path) -> None:
+    frames = np.arange(24, dtype=np.int16).reshape(2, 3, 4)
+    units = [fits.PrimaryHDU(np.zeros(1, np.int16)), fits.ImageHDU(frames)]
+    fits.HDUList(units).writeto(tmp_path / "a.fits")
+    np.testing.assert_array_equal(read_array(tmp_path / "a.fits"), frames)
+    fits.HDUList(units[:1]).writeto(tmp_path / "b.fits")
+    assert read_array(tmp_path / "b.fits").shape == (1,)
+
+
 def test_no_such_extension_no_image_no_fits(tmp_path: Path) -> None:
     path = save(tmp_path / "a.fits", cube())
     with refused("'SCI'", "PRIMARY"):

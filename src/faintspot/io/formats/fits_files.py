@@ -151,14 +151,16 @@ def _columns(path: Path, unit: fits_units.HeaderDataUnit) -> dict[str, fits_unit
 
 
 def _find_unit(path: Path, key: str | None) -> tuple[fits_units.HeaderDataUnit, fits_units.Column | None]:
-    """Return the first image, or the image, or table and column, named `key`."""
-    names, wanted = [], "" if key is None else key.strip().upper()
+    """Return the first image with two axes or more, else any, or the image or column named `key`."""
+    names, line, wanted = [], None, "" if key is None else key.strip().upper()
     for unit in fits_units.units_of(path):
         columns = _columns(path, unit)
         listed = f" (a binary table; name a column, as {path.name}:COLUMN: {', '.join(columns)})"
         names.append(unit.name + (listed if columns else ""))
         if key is None and unit.shape:
-            return unit, None
+            if len(unit.shape) > 1:
+                return unit, None
+            line = line or unit  # some cameras write a primary image of one number before the frames
         if wanted in (unit.name.upper(), str(unit.index)):
             if not unit.shape:
                 found = names[-1] if columns else "none there"
@@ -167,6 +169,8 @@ def _find_unit(path: Path, key: str | None) -> tuple[fits_units.HeaderDataUnit, 
         column = next((column for name, column in columns.items() if name.upper() == wanted), None)
         if column is not None:
             return unit, column
+    if line is not None:
+        return line, None
     sought = "an image" if key is None else f"an extension or a column {key!r}"
     raise InputError(f"{path}: expected {sought}, the file has only: {', '.join(names)}")
 
