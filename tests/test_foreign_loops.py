@@ -1,11 +1,14 @@
 """The benchmark of foreign loops runs; nothing is asserted of who wins."""
 
 import json
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
+from benchmarks.foreign import evaluation, rows
 from benchmarks.foreign.evaluation import INTEGRATOR
+from benchmarks.foreign.oopao import OopaoCase
 from benchmarks.foreign_loops import publish, run_command, table_of
 from click.testing import CliRunner
 
@@ -13,8 +16,12 @@ from faintspot.loop.telemetry.choices import FILTER
 
 
 @pytest.mark.slow
-def test_a_quick_row_is_stored_and_shown(tmp_path: Path) -> None:
+def test_a_quick_row_is_stored_and_shown(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a smaller telescope; scored are 60 frames, whose Strehl ratio is far from that without a mirror."""
     pytest.importorskip("OOPAO")
+    case = OopaoCase("small", lenslets=5, lenslet_px=8, diameter_m=3.0)
+    monkeypatch.setattr(rows, "ROWS", [rows.Row("oopao-20", "small", partial(rows._oopao, case))])
+    monkeypatch.setattr(evaluation, "QUICK", evaluation.Effort(210, 3.0, (3,), (0.4,), with_others=False))
     options = ["--rows", "oopao-20", "--quick", "--folder", str(tmp_path)]
     first = CliRunner().invoke(run_command, options)
     assert first.exit_code == 0, first.output
