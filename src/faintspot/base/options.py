@@ -130,7 +130,9 @@ class Option:
         try:
             names = [one_of(name, item, self.choices) for item in value]
         except TypeError:
-            raise InputError("expected one value or one per sub-aperture", name=name, value=value) from None
+            names = []
+        if not names:
+            raise InputError("expected one value or one per sub-aperture", name=name, value=value)
         return _locked(np.array(names))
 
     def _checked_numbers(self, name: str, value: object) -> NDArray[Any]:

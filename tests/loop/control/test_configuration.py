@@ -75,9 +75,6 @@ BAD[3, 4] = np.nan
         ),
         ('interaction_matrix = "good.npy"\ngian = 1', "control.gian: unknown key; did you mean gain?"),
         ('interaction_matrix = "good.npy"\ngain = 3', "control.gain = 3: expected a number from 0 to 2"),
-        ('interaction_matrix = "good.npy"\ndelay_frames = 0', "delay_frames = 0"),
-        ('interaction_matrix = "good.npy"\ncontroller = "pid"', "expected one of 'integrator'"),
-        ('interaction_matrix = "good.npy"\nlargest_command = 0', "largest_command = 0"),
     ],
 )
 def test_what_is_refused(tmp_path: Path, line: str, message: str) -> None:

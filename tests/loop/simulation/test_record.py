@@ -1,14 +1,12 @@
 from dataclasses import fields
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 from tests.loop.simulation.loop_cases import faint, plain
 
-import faintspot as fs
 from faintspot.base.errors import InputError
-from faintspot.loop.simulation import LoopRecord, Method, simulate_loop
+from faintspot.loop.simulation import LoopRecord, simulate_loop
 
 pytest.importorskip("hcipy")
 
@@ -55,12 +53,3 @@ def test_files_that_are_no_records_are_refused(tmp_path: Path) -> None:
 def test_a_place_that_cannot_be_written_is_named(record: LoopRecord, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="cannot be written"):
         record.save(tmp_path / "nowhere" / "run.npz")
-
-
-@pytest.mark.parametrize(
-    "values",
-    [{"label": ""}, {"settings": None}, {"gain": -1.0}, {"gain": float("nan")}],
-)
-def test_bad_methods_are_refused(values: dict[str, Any]) -> None:
-    with pytest.raises(InputError, match=r"method\."):
-        Method(**{"label": "a", "settings": fs.Settings("brightest"), **values})

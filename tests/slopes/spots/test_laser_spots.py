@@ -50,10 +50,8 @@ def test_what_is_refused() -> None:
         lambda **changes: question(LaserSpots.from_table({**LASER, **changes})),
         at_m=[[3.6]],
         launch_m=[[np.nan, 0.0]],
-        spot_fwhm_arcsec=[0],
         profile=[[3.0]],
         zenith=["3"],
-        zenith_distance_deg=[90],
     )
     with refused("none.npz"):
         LaserSpots.from_table({**LASER, "profile": "none.npz"})

@@ -116,7 +116,7 @@ class StudySpecification(Options):
 
     name: str = setting(REQUIRED, kind=TEXT)
     sweeps: Sequence[Sweep] = setting(REQUIRED, check=_checked_sweeps)
-    seed: int = number(1, 0, 2**63 - 1, whole=True)
+    seed: int = number(1, 0, 2**53, whole=True)
     realisations: int = number(10_000, 20, 10_000_000, whole=True)
     estimators: Sequence[str] = setting(DEFAULT_METHODS, check=_checked_estimators)
     options: Any = setting((), check=_checked_options)

@@ -126,7 +126,7 @@ class RunLength(ConfigurationTable, table="run"):
     frames: int = number(1500, 1, 10_000_000, whole=True)
     settle_frames: int = number(100, 0, 10_000_000, whole=True)
     """Number of frames at the beginning that are not scored."""
-    seed: int = number(1, 0, 2**63 - 1, whole=True)
+    seed: int = number(1, 0, 2**53, whole=True)
     realisations: int = number(5, 1, 100_000, whole=True)
     photons_per_subaperture: tuple[float, ...] = number((), 0.0, 1e9, low_open=True, kind=LIST)
     """Fluxes at which estimators are compared."""
