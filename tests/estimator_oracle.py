@@ -191,14 +191,16 @@ def by_posterior(case: Case, s: int, g: Floats, task: Task) -> Estimate:
     at_peak = spread <= 1 and away <= 1
     first = Estimate(peak.x, peak.y, peak.flux) if at_peak else replace(broad, flux=flux)
     fitted = oracle.fisher(g, task, "map", first)
-    margin = min(fitted.margin, abs(away - 1), peak.margin if at_peak else math.inf)
+    margin, replaced = min(fitted.margin, abs(away - 1), peak.margin if at_peak else math.inf), 0
     for axis in "xy":
         spread = getattr(broad, f"error_{axis}") / task.error_scale / (0.5 * spacing)
         margin = min(margin, abs(spread - 1))
-        if spread > 1 or math.isinf(getattr(fitted, f"error_{axis}")):
-            names = (axis, f"error_{axis}")
-            fitted = replace(fitted, **{name: getattr(broad, name) for name in names})
-    return replace(fitted, margin=margin)
+        names = (axis, f"error_{axis}")
+        if spread > 1 or math.isinf(getattr(fitted, names[1])):
+            covariance = fitted.covariance * getattr(broad, names[1]) / getattr(fitted, names[1])
+            fitted = replace(fitted, covariance=covariance, **{name: getattr(broad, name) for name in names})
+            replaced += 1
+    return replace(fitted, margin=margin, covariance=(broad if replaced == 2 else fitted).covariance)
 
 
 def by_weight(case: Case, s: int, g: Floats, task: Task) -> Estimate:
@@ -299,6 +301,7 @@ def assert_equals_oracle(case: Case, slopes: fs.Slopes) -> int:
             bound = FLOOR_PX + relative * value + ROUNDING * change
             result = getattr(slopes, name.replace("error", "standard_error"))[s]
             assert abs(result - value) <= bound, (s, name, float(result), value, bound)
+        assert_covariance_is(expected, shaken, float(slopes.covariance_xy[s]))
         if not cut[s]:
             assert_search_limit_flagged(case, s, [expected, *shaken], slopes)
         assert slopes.flags[s] & cut[s] == cut[s]
@@ -306,6 +309,16 @@ def assert_equals_oracle(case: Case, slopes: fs.Slopes) -> int:
         if "steps" in case.settings.declared() and len(moving) == 1:
             assert bool(slopes.flags[s] & fs.SubapertureFlag.NOT_CONVERGED) == moving.pop(), (s, expected)
     return compared
+
+
+def assert_covariance_is(expected: Estimate, shaken: list[Estimate], found: float) -> None:
+    """A covariance is compared where it is known, in units of the errors' product."""
+    largest = expected.error_x * expected.error_y
+    if math.isfinite(largest + expected.covariance):
+        value, *others = (np.clip(each.covariance, -largest, largest) for each in (expected, *shaken))
+        change = max(abs(other - value) for other in others)
+        allowed = 1e-3 * largest + FLOOR_PX * (expected.error_x + expected.error_y) + ROUNDING * change
+        assert abs(found - value) <= allowed, (expected, found)
 
 
 def assert_search_limit_flagged(case: Case, s: int, found: list[Estimate], slopes: fs.Slopes) -> None:

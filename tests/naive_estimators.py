@@ -81,6 +81,8 @@ class Estimate:
     """How near a decision was to another one: below 1e-3 rounding to float32 may turn it."""
     moves: tuple[float, ...] = (1.0, 0.0)
     """How far each step went, the larger of x and y."""
+    covariance: float = math.nan
+    """Of the errors along x and y, where the method states it: at most their product."""
 
     @property
     def is_moving(self) -> bool:
@@ -194,7 +196,7 @@ def fisher(g: ArrayLike, task: Task, name: str, begin: Estimate) -> Estimate:
     x, y, flux = clamp(begin.x, *limits[0]), clamp(begin.y, *limits[1]), begin.flux
     level, most = 0.0, largest_move(*task.fwhm)
     moves: tuple[float, ...] = (most,)
-    errors = (math.inf, math.inf)
+    errors, covariance = (math.inf, math.inf), math.nan
     for _ in range(task.steps):
         f, fx, fy = task.spot.images(x, y, g.shape)
         m, dm = flux * f, [flux * fx, flux * fy, f] + [np.ones_like(f)] * task.background
@@ -217,12 +219,13 @@ def fisher(g: ArrayLike, task: Task, name: str, begin: Estimate) -> Estimate:
                 left = np.linalg.solve(i[np.ix_(rest, rest)], score[rest] - i[rest, axis] * move[axis])[0]
                 move[other] = clamp(left / growth, -most, most)
         move = np.array([clamp(step, *within) for step, within in zip(move, room, strict=True)])
-        errors = sandwich(i, j) if soundness(i) > 1e-5 else (math.inf, math.inf)
+        *errors, covariance = sandwich(i, j) if soundness(i) > 1e-5 else (math.inf, math.inf, math.nan)
         x, y = x + move[0], y + move[1]
         others = np.linalg.solve(i[2:, 2:], score[2:] - i[2:, :2] @ move)
         flux = max(clamp(flux + others[0], flux / 2, flux * 2), LEAST_FLUX)
         level += others[1] if task.background else 0.0
-    return Estimate(x, y, flux, task.error_scale * errors[0], task.error_scale * errors[1], margin, moves)
+    error_x, error_y = (task.error_scale * error for error in errors)
+    return Estimate(x, y, flux, error_x, error_y, margin, moves, task.error_scale**2 * covariance)
 
 
 def soundness(i: Floats) -> float:
@@ -234,11 +237,11 @@ def soundness(i: Floats) -> float:
     return float((diagonal - a[0, 1] ** 2) / diagonal) if min(a[0, 0], a[1, 1]) > 0 else 0.0
 
 
-def sandwich(i: Floats, j: Floats) -> tuple[float, float]:
-    """Roots of the diagonal of I^-1 J I^-1 for x and y."""
+def sandwich(i: Floats, j: Floats) -> tuple[float, float, float]:
+    """Errors along x and y from I^-1 J I^-1, and their covariance."""
     inverse = np.linalg.inv(i)
     covariance = inverse @ j @ inverse
-    return math.sqrt(covariance[0, 0]), math.sqrt(covariance[1, 1])
+    return math.sqrt(covariance[0, 0]), math.sqrt(covariance[1, 1]), float(covariance[0, 1])
 
 
 def grid_posterior(g: ArrayLike, task: Task, flux: float, xs: Floats, ys: Floats, cell: float) -> Estimate:
@@ -271,7 +274,9 @@ def grid_posterior(g: ArrayLike, task: Task, flux: float, xs: Floats, ys: Floats
     mean_x, mean_y = float(np.sum(p * xs)), float(np.sum(p * ys[:, None]))
     error_x = math.sqrt(np.sum(p * (xs - mean_x) ** 2))
     error_y = math.sqrt(np.sum(p * (ys[:, None] - mean_y) ** 2))
-    return Estimate(mean_x, mean_y, flux, task.error_scale * error_x, task.error_scale * error_y)
+    covariance = task.error_scale**2 * float(np.sum(p * (xs - mean_x) * (ys[:, None] - mean_y)))
+    errors = task.error_scale * error_x, task.error_scale * error_y
+    return Estimate(mean_x, mean_y, flux, *errors, covariance=covariance)
 
 
 # Centres of gravity -----------------------------------------------------------------------------------
@@ -309,7 +314,8 @@ def weighted(g: ArrayLike, task: Task, begin: Estimate) -> Estimate:
     error_x, error_y = (
         (task.error_scale * gain * e for e in errors) if total > floor else (math.inf, math.inf)
     )
-    return Estimate(x, y, total, error_x, error_y, margin, moves)
+    covariance = (task.error_scale * gain / total) ** 2 * float(np.sum(noise * (u - x) * (v - y)))
+    return Estimate(x, y, total, error_x, error_y, margin, moves, covariance)
 
 
 def fixed_window(
@@ -340,11 +346,14 @@ def fixed_window(
     flux = float(np.sum(weights[2] * g))
     divisor = flux if divisor is None else divisor
     found, errors = [], []
+    pixels = (task.error_scale / divisor) ** 2 * (
+        task.variance + task.excess * divisor * np.maximum(spot, 0.0)
+    )
     for axis in range(2):
         found.append(float(np.sum(weights[axis] * g)) / divisor - float(np.sum(weights[axis] * spot)))
-        noise = weights[axis] ** 2 * (task.variance + task.excess * divisor * np.maximum(spot, 0.0))
-        errors.append(task.error_scale * math.sqrt(max(float(noise.sum()), 0.0)) / divisor)
-    return Estimate(found[0], found[1], flux, errors[0], errors[1])
+        errors.append(math.sqrt(max(float(np.sum(weights[axis] ** 2 * pixels)), 0.0)))
+    covariance = float(np.sum(weights[0] * weights[1] * pixels))
+    return Estimate(found[0], found[1], flux, errors[0], errors[1], covariance=covariance)
 
 
 def gravity_error(

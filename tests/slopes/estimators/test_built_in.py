@@ -88,6 +88,17 @@ def test_standard_errors_are_the_scatter_or_none(name: str, flux_e: float, noise
     assert stated == pytest.approx(scatter, rel=0.2 if name == "tv" else 0.15)
 
 
+@pytest.mark.parametrize("window", [(5, 17), (17, 5)])
+def test_a_spot_far_along_a_narrow_window_is_where_it_is(window: tuple[int, int]) -> None:
+    """Farther from the middle than the window is wide, on either side."""
+    along = [(6.0, 0.3), (-6.0, 0.3)] if window[1] > window[0] else [(0.3, 6.0), (0.3, -6.0)]
+    layout = fs.Layout.grid((1, 2), pixels=window)
+    frame = np.hstack(spots(along, shape=window, flux_e=1e4, profile="gaussian"))
+    slopes = fs.SlopePipeline(layout, fs.Settings("brightest", keep_brightest=20))(frame)
+    assert slopes.valid.all()
+    np.testing.assert_allclose(np.stack([slopes.x, slopes.y], axis=1), along, atol=0.02)
+
+
 @pytest.mark.slow  # compiled anew at other SIMD widths
 @pytest.mark.parametrize("side", [8, 12, 16])
 def test_a_threshold_gives_the_same_at_every_width_bit_for_bit(side: int) -> None:

@@ -5,7 +5,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import settings
+from hypothesis.stateful import run_state_machine_as_test
 from scipy.signal import lfilter
+from tests.loop.control.control_states import Controls
 from tests.loop.control.modal_cases import (
     NOISE,
     Floats,
@@ -14,6 +17,7 @@ from tests.loop.control.modal_cases import (
     recorded,
     wandering,
 )
+from tests.patience import USUAL_EXAMPLES
 
 from faintspot.base.errors import InputError
 from faintspot.loop.control.base import CommandDelayLine
@@ -105,6 +109,12 @@ def test_controller_from_a_file_does_the_same(tip_tilt: PredictiveControl, tmp_p
     for row, command in zip(rows, commands_of_matrices(file, rows), strict=True):
         alone.update(*tip_tilt._controlled(tip_tilt._loop.scale * row, np.ones(2)))
         np.testing.assert_allclose(command, line.latest, atol=1e-9)
+
+
+def test_a_controller_is_its_model_whatever_comes(tip_tilt: PredictiveControl) -> None:
+    machine = type("TipTilt", (Controls,), {"learnt": tip_tilt})
+    examples = settings().max_examples * 10 // USUAL_EXAMPLES
+    run_state_machine_as_test(machine, settings=settings(max_examples=examples, stateful_step_count=15))
 
 
 def test_slopes_that_are_not_measured(tip_tilt: PredictiveControl) -> None:
