@@ -126,6 +126,15 @@ class TestMeans:
         assert np.array_equal(before.vector, after.vector)
         assert not no_flux(after).any()
 
+    def test_single_frames_have_them_although_others_were_measured_before(self) -> None:
+        flux_e, dark = some_dark(300.0)
+        pipeline = fs.SlopePipeline(LAYOUT, fs.Settings("brightest", keep_brightest=9))
+        lit = frames_of(300.0, 1)
+        assert pipeline(lit[0]).valid.all()
+        found = pipeline.with_dark(frames_of(flux_e, 20).mean(axis=0))
+        assert np.array_equal(no_flux(found(lit[0])), dark)
+        assert np.array_equal(no_flux(found(lit))[0], dark)
+
     def test_small_windows_are_not_tested(self) -> None:
         layout = fs.Layout.grid((3, 3), pixels=2)
         pipeline = fs.SlopePipeline(layout, fs.Settings("centroid"))

@@ -156,11 +156,13 @@ def test_binned_frames_are_followed() -> None:
     pipeline = record.pipeline()
     layout = magnified_layout(record.layout, 2, big.shape[1:])
     settings = pipeline.settings.magnified(2)
-    binned = fs.SpotFollower(fs.SlopePipeline(layout, settings, fs.Calibration(read_noise_e=1.5)))(big)
+    camera = fs.Calibration(read_noise_e=1.5, saturation_adu=1.01 * float(big.max()))
+    binned = fs.SpotFollower(fs.SlopePipeline(layout, settings, camera))(big)
     plain = followed(record)
     both = plain.valid & binned.valid
     assert both.mean() > 0.9
     np.testing.assert_allclose(binned.x[both], 2 * plain.x[both], atol=0.05)
+    assert not (binned.flags & int(FLAG.SATURATED)).any()  # sums of four pixels are above it
 
 
 def test_empty_and_broken_frames_do_not_move_the_windows() -> None:

@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from faintspot import Layout
-from faintspot.slopes.sensor.pupil import Pupil, pupil_of
+from faintspot.slopes.sensor.pupil import Pupil, lenslet_outlines, pupil_of
 
 SIDE = 8
 OFFSETS = (np.arange(16) + 0.5) / 16 - 0.5
@@ -70,3 +70,23 @@ def test_a_stated_size_stands() -> None:
     np.testing.assert_allclose(found, [7.2, 7.0, 5.5], atol=0.1)
     assert pupil.cuts
     assert pupil.error_subapertures == 0
+
+
+@pytest.mark.parametrize(("geometry", "turn_deg"), [("square", 90.0), ("hexagonal", 60.0)])
+def test_neighbours_share_a_side_half_way_between_them(geometry: str, turn_deg: float) -> None:
+    """Lattices turned by 7 degrees: its sides are perpendicular to the lines to the neighbours."""
+    turns = np.radians(7.0 + turn_deg * np.arange(round(360 / turn_deg)))
+    directions = np.stack([np.cos(turns), np.sin(turns)], axis=1)
+    centres = np.vstack([[20.0, 20.0], 20.0 + 10.0 * directions])
+    layout = Layout(
+        (40, 40),
+        (6, 6),
+        np.rint(centres[:, ::-1] - 2.5),
+        centres,
+        geometry=geometry,
+        pitch_px=10.0,
+        angle_deg=7.0,
+    )
+    middle = lenslet_outlines(layout)[0] - 20.0
+    along = np.sort(middle @ directions.T, axis=0)
+    np.testing.assert_allclose(along[-2:], 5.0, atol=1e-9)

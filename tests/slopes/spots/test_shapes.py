@@ -70,6 +70,8 @@ def test_elongation_and_rotation(profile: str) -> None:
     # Turning by 90 degrees swaps rows and columns, by 180 changes nothing, a mirror reverses the angle.
     np.testing.assert_allclose(image(0.4, -0.9, 90), image(-0.9, 0.4, 0).T, atol=ROUND_OFF)
     np.testing.assert_allclose(image(0.4, -0.9, 180), image(0.4, -0.9, 0), atol=ROUND_OFF)
+    np.testing.assert_allclose(image(0.4, -0.9, 270), image(0.4, -0.9, 90), atol=ROUND_OFF)
+    np.testing.assert_allclose(image(0.4, -0.9, -90), image(0.4, -0.9, 90), atol=ROUND_OFF)
     np.testing.assert_allclose(image(0.4, -0.9, 215), image(0.4, -0.9, 35), atol=ROUND_OFF)
     np.testing.assert_allclose(image(0.4, -0.9, 35), image(0.4, 0.9, -35)[::-1], atol=ROUND_OFF)
     np.testing.assert_allclose(image(0.4, -0.9, 35), image(-0.9, 0.4, 55).T, atol=ROUND_OFF)

@@ -25,8 +25,9 @@ def test_gain_and_its_error() -> None:
     rng = np.random.default_rng(1)
     true = rng.uniform(0.4, 1.2, 200)
     drift = np.cumsum(rng.normal(0.0, 0.01, (FRAMES, 200)), axis=0)
-    slopes = true * DITHER[:, None] + drift + rng.normal(0.0, 0.5, (FRAMES, 200))
-    found = measure_centroid_gain(slopes, np.stack([DITHER, DITHER], axis=1))
+    moved = np.stack([DITHER, 0.3 * np.cos(2 * np.pi * 0.091 * np.arange(FRAMES))], axis=1)
+    slopes = true * moved.repeat(100, axis=1) + drift + rng.normal(0.0, 0.5, (FRAMES, 200))
+    found = measure_centroid_gain(slopes, moved)
     away = (found.gain.T.ravel() - true) / found.standard_error.T.ravel()
     assert abs(away.mean()) < 0.25  # 3.5 standard errors of a mean of 200
     assert 0.85 < away.std() < 1.25  # 20 stretches each know their scatter to 16 %, 200 of them the mean

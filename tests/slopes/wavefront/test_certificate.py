@@ -38,6 +38,10 @@ def test_sizes_of_a_wavefront_without_noise() -> None:
     vergence = 4e-9 * NM_PER_PX * np.sqrt(3) * 0.4 / 2.1**2
     assert found.vergence_per_m.value == pytest.approx(vergence, rel=1e-3)
     assert found.radius_of_curvature_m.value == pytest.approx(1 / vergence, rel=1e-3)
+    errors = [
+        each.standard_error / each.value for each in (found.radius_of_curvature_m, found.vergence_per_m)
+    ]
+    assert errors[0] == pytest.approx(errors[1])
     strehl = np.exp(-((2 * np.pi * found.rms_without_tilt.value / 4000.0) ** 2))
     assert found.strehl.value == pytest.approx(strehl)
     assert found.strehl.low < strehl < found.strehl.high

@@ -56,6 +56,7 @@ def test_cube_beats_cosmic_rays_and_bad_pixels_may_be_nan() -> None:
     np.testing.assert_array_equal(cube, before)
     assert grid.pitch_px == pytest.approx(16.0, rel=0.01)
     assert truth.wrong(grid)[0] <= 2
+    np.testing.assert_allclose(grid.flux, find_lenslets(cube[0], bad_pixels=bad).flux, rtol=1e-9)
 
 
 def spots_at(positions: list[tuple[int, int]]) -> NDArray[np.float64]:
