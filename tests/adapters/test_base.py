@@ -28,6 +28,7 @@ from faintspot.adapters.base import (
     check_version,
     parts_of,
     predicted,
+    window_corners,
 )
 
 LAYOUT = fs.Layout.stacked(N, (SIDE, SIDE))
@@ -234,3 +235,11 @@ def test_what_a_tools_file_says(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="expected a file or tables"):
         parts_of(3)  # type: ignore[arg-type]
     assert parts_of({**tables, "psf": {"profile": "gaussian", "size": 1.0}}).psf is not None
+
+
+@pytest.mark.parametrize("side", [7, 8])
+def test_windows_are_those_nearest_to_their_lenslets(side: int) -> None:
+    """Their middles lie within half a pixel of the centres, x before y."""
+    centres = np.random.default_rng(1).uniform(20.0, 90.0, (200, 2))
+    middles = window_corners(centres, side)[:, ::-1] + 0.5 * (side - 1)
+    assert np.abs(middles - centres).max() <= 0.5

@@ -12,8 +12,6 @@ import faintspot as fs
 from faintspot.base.errors import InputError
 from faintspot.engine.running_settings import RunningSettings
 
-pytestmark = pytest.mark.slow
-
 LAYOUT = fs.Layout.grid((2, 3), pixels=8)
 N = len(LAYOUT)
 SETTINGS = fs.Settings(noise_std=0.5, keep_brightest=9)
@@ -146,6 +144,7 @@ def test_history_is_not_changed_from_outside(live: RunningSettings[fs.SlopePipel
     assert history(live) == [(5, {"noise_std": [1.0, 2.0]}, [0, 1])]
 
 
+@pytest.mark.slow
 def test_many_threads_propose_while_frames_are_taken() -> None:
     """No change is lost or taken out of order, and every frame's settings are those of its history."""
     live = RunningSettings(lambda settings: fs.SlopePipeline(LAYOUT, settings, threads=1), SETTINGS)

@@ -56,7 +56,10 @@ class SlopeFiles(RuleBasedStateMachine):
     def append(self, count: int) -> None:
         assert self.writer is not None
         stop = min(self.appended + count, FRAMES)
-        self.writer.append(self.appended, part(WHOLE, self.appended, stop))
+        block = {name: values.copy() for name, values in part(WHOLE, self.appended, stop).items()}
+        self.writer.append(self.appended, block)
+        for values in block.values():
+            values[:] = 0  # who measures may use its arrays again
         self.appended = stop
 
     @precondition(lambda self: self.writer is not None and self.appended < FRAMES)

@@ -11,7 +11,8 @@ from tests.patience import mostly_slow
 from faintspot.loop.control.identification.layers import Identification
 from faintspot.loop.control.identification.loop_delay import LoopDelay
 from faintspot.loop.control.identification.open_loop import Measured, open_loop_of, site_of_loop
-from faintspot.loop.telemetry.spectra import recorded_discrepancy
+from faintspot.loop.control.identification.vibrations import MODES
+from faintspot.loop.telemetry.spectra import OTHERS, modal_spectra, recorded_discrepancy
 
 
 def found(change: np.ndarray, missing: float = 0.0) -> list[Measured]:
@@ -47,3 +48,17 @@ def test_too_few_slopes() -> None:
     for each in recorded_discrepancy(loop, seen, identified.of_winds(np.zeros((1, 2)))):
         assert not np.isfinite(each.value)
         assert "too few" in each.remark
+
+
+def test_a_spectrum_is_variance_by_frequency() -> None:
+    """White noise of 0.2 px in four sub-apertures: modes have its variance up to half the rate."""
+    loop = recorded().part(slice(0, 1500))
+    seen = open_loop_of(loop, LoopDelay(2.0, 0.0, 1.0, 0.0)).telemetry
+    noise = np.random.default_rng(1).normal(0.0, 0.2, seen.open_loop_px.shape)
+    measured = np.tile(np.isin(np.arange(25), [6, 8, 16, 18]), 2)
+    telemetry = replace(seen, open_loop_px=noise, variance_px2=np.where(measured, seen.variance_px2, np.inf))
+    identified = Identification(telemetry, site_of_loop(loop), loop.frame_rate_hz)
+    spectra = modal_spectra(telemetry, identified.of_winds(np.zeros((1, 2))))
+    for name in (*MODES, OTHERS):
+        density = spectra.measured[name].mean()  # known to 4 % from 1500 frames
+        assert density * loop.frame_rate_hz / 2 == pytest.approx(0.2**2, rel=0.15)

@@ -209,6 +209,8 @@ def test_commands_are_about_the_flat_one_and_slopes_about_their_references(
             expected = np.array([plain(row) for row in rows])
             sent = np.array([control(row + reference) for row in rows])
             np.testing.assert_allclose(sent - flat, expected, atol=1e-9)
+            for latest, values in zip(control._latest(70), (rows + reference, sent), strict=True):
+                np.testing.assert_allclose(latest, values, rtol=1e-6, atol=1e-5)  # float32
     offset.reset()
     np.testing.assert_allclose(offset(reference), flat, atol=1e-9)
 

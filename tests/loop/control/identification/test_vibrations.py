@@ -9,6 +9,7 @@ from tests.patience import mostly_slow
 from faintspot.loop.control.identification.vibrations import (
     MODES,
     Vibration,
+    _errors,
     find_vibrations,
     without_passing_grid,
 )
@@ -44,6 +45,13 @@ def test_a_weak_line_beside_a_broad_maximum_is_found(frequency_hz: float, dampin
     assert found.frequency_error_hz < 0.5
     # Driven at random for 12 s, its rms differs from the expected one by 15 %.
     assert found.rms_px == pytest.approx(true.rms_px, rel=0.4)
+
+
+def test_errors_are_those_of_a_normal_distribution() -> None:
+    covariance = np.array([[0.04, 0.01], [0.01, 0.09]])
+    information, best = np.linalg.inv(covariance), np.array([3.0, -2.0])
+    errors = _errors(lambda at: 0.5 * float((at - best) @ information @ (at - best)), best)
+    np.testing.assert_allclose(errors, [0.2, 0.3], rtol=1e-6)
 
 
 def _passing(*moving: Vibration) -> tuple[Vibration, ...]:
