@@ -196,7 +196,7 @@ def fisher(g: ArrayLike, task: Task, name: str, begin: Estimate) -> Estimate:
     x, y, flux = clamp(begin.x, *limits[0]), clamp(begin.y, *limits[1]), begin.flux
     level, most = 0.0, largest_move(*task.fwhm)
     moves: tuple[float, ...] = (most,)
-    errors, covariance = (math.inf, math.inf), math.nan
+    stated = (math.inf, math.inf, math.nan)
     for _ in range(task.steps):
         f, fx, fy = task.spot.images(x, y, g.shape)
         m, dm = flux * f, [flux * fx, flux * fy, f] + [np.ones_like(f)] * task.background
@@ -219,13 +219,13 @@ def fisher(g: ArrayLike, task: Task, name: str, begin: Estimate) -> Estimate:
                 left = np.linalg.solve(i[np.ix_(rest, rest)], score[rest] - i[rest, axis] * move[axis])[0]
                 move[other] = clamp(left / growth, -most, most)
         move = np.array([clamp(step, *within) for step, within in zip(move, room, strict=True)])
-        *errors, covariance = sandwich(i, j) if soundness(i) > 1e-5 else (math.inf, math.inf, math.nan)
+        stated = sandwich(i, j) if soundness(i) > 1e-5 else (math.inf, math.inf, math.nan)
         x, y = x + move[0], y + move[1]
         others = np.linalg.solve(i[2:, 2:], score[2:] - i[2:, :2] @ move)
         flux = max(clamp(flux + others[0], flux / 2, flux * 2), LEAST_FLUX)
         level += others[1] if task.background else 0.0
-    error_x, error_y = (task.error_scale * error for error in errors)
-    return Estimate(x, y, flux, error_x, error_y, margin, moves, task.error_scale**2 * covariance)
+    error_x, error_y = (task.error_scale * error for error in stated[:2])
+    return Estimate(x, y, flux, error_x, error_y, margin, moves, task.error_scale**2 * stated[2])
 
 
 def soundness(i: Floats) -> float:

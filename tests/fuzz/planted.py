@@ -41,7 +41,10 @@ class Fault(NamedTuple):
 def faults() -> list[Fault]:
     """Return all faults, in the order of the layers."""
     table = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
-    return [Fault(name, row["file"], *row["change"], row["tests"]) for name, row in table.items()]
+    return [
+        Fault(name, row["file"], old=row["change"][0], new=row["change"][1], tests=row["tests"])
+        for name, row in table.items()
+    ]
 
 
 def main() -> int:

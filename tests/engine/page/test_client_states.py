@@ -27,7 +27,7 @@ from faintspot.engine.page.server import Client
 
 KINDS = "now", "pictures", "sensor"
 GARBAGE = b"{}", "{", "[]", '{"do": 1}', '{"do": "\\ud800"}'
-WORDS = {
+WORDS: dict[str, dict[str, Any]] = {
     "right": {"do": "hello", "token": True},
     "wrong": {"do": "hello", "token": "guessed"},
     "nothing": {"do": "hello"},
@@ -49,7 +49,9 @@ class Played(Client):
         self.is_greeted = self.knows_token = False
         """As it ought to be."""
 
-    async def write_message(self, message: Any, binary: bool = False) -> None:
+    async def write_message(  # type: ignore[override]
+        self, message: Any, binary: bool = False
+    ) -> None:
         if self.is_closed:
             raise WebSocketClosedError
         if not binary:

@@ -97,6 +97,7 @@ class Controls(RuleBasedStateMachine):
     @precondition(lambda self: self.copy is not None)
     @rule()
     def go_on_with_the_copy(self) -> None:
+        assert self.copy is not None
         self.control, self.copy = self.copy, None
 
     @invariant()

@@ -93,7 +93,7 @@ def test_a_spot_far_along_a_narrow_window_is_where_it_is(window: tuple[int, int]
     """Farther from the middle than the window is wide, on either side."""
     along = [(6.0, 0.3), (-6.0, 0.3)] if window[1] > window[0] else [(0.3, 6.0), (0.3, -6.0)]
     layout = fs.Layout.grid((1, 2), pixels=window)
-    frame = np.hstack(spots(along, shape=window, flux_e=1e4, profile="gaussian"))
+    frame = np.hstack([*spots(along, shape=window, flux_e=1e4, profile="gaussian")])
     slopes = fs.SlopePipeline(layout, fs.Settings("brightest", keep_brightest=20))(frame)
     assert slopes.valid.all()
     np.testing.assert_allclose(np.stack([slopes.x, slopes.y], axis=1), along, atol=0.02)

@@ -67,7 +67,7 @@ def test_errors_follow_correlated_noise() -> None:
     slopes = slopes_of(noise)
     changed = [0.01 * along[0] * along[1], *np.sqrt(0.01 * along**2 + 0.03**2)]
     names = "covariance_xy", "standard_error_x", "standard_error_y"
-    rows = (np.broadcast_to(values, slopes.x.shape).astype(np.float32) for values in changed)
+    rows: Any = (np.broadcast_to(values, slopes.x.shape).astype(np.float32) for values in changed)
     slopes = replace(slopes, **dict(zip(names, rows, strict=True)))
     found = fit_wavefront(slopes, LAYOUT, modes=9)
     # The scatter of 4000 frames is known to 1.1 %.
