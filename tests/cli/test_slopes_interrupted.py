@@ -16,8 +16,8 @@ pytest.importorskip("zarr")
 
 pytestmark = pytest.mark.slow
 
-N_FRAMES = 12_000  # three chunks of a store
-ITERATIONS = 800  # so that a run takes some seconds, and no signal comes after its end
+N_FRAMES = 10_000  # three chunks of a store, the last one short
+ITERATIONS = 500  # so that a run takes some seconds, and no signal comes after its end
 SETTINGS = Settings(noise_std=2.0, keep_brightest=10, tolerance=0.0, max_iterations=ITERATIONS)
 
 
