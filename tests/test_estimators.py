@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import replace
-from itertools import product
 from typing import Any
 
 import numpy as np
@@ -84,10 +83,9 @@ class TestAgainstOracle:
         assert_equals_oracle(case, case.measure())
 
     @pytest.mark.slow
-    # Each is compiled anew: at 8 lanes the families; every estimator is compared at 4 lanes elsewhere.
-    @pytest.mark.parametrize(
-        ("width", "estimator"), [*product((16,), QUICK), *product((8,), ("tv", "window", "ml"))]
-    )
+    # Each is compiled anew: one of each family; `make fuzz` compares every estimator at every width.
+    @pytest.mark.parametrize("width", [8, 16])
+    @pytest.mark.parametrize("estimator", ["tv", "window", "ml"])
     def test_any_simd_width(self, estimator: str, width: int) -> None:
         case = random_case(width, estimator, n=7)
         assert assert_equals_oracle(case, case.measure(width=width)) > 2
@@ -203,7 +201,7 @@ class TestNoiseMap:
             np.testing.assert_allclose(getattr(found, name), values, rtol=1e-5, atol=1e-5, err_msg=name)
 
     @pytest.mark.slow
-    @pytest.mark.parametrize("estimator", ["tv", "weighted", "map"])
+    @pytest.mark.parametrize("estimator", ["tv", "weighted"])
     def test_images_and_widths(self, estimator: str) -> None:
         """Calibrated images and other SIMD widths give what the frames give."""
         case = with_noise_map(random_case(22, estimator, n=9), 1)

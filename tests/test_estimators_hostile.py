@@ -107,8 +107,8 @@ class TestImages:
         assert_sane(slopes)
         assert np.mean(slopes.flags == 0) < most
 
-    @pytest.mark.slow
-    @EVERY
+    @pytest.mark.slow  # compiled anew, for whole numbers: one of each family
+    @pytest.mark.parametrize("estimator", ["brightest", "tv", "window", "ml"])
     def test_bad_pixels_and_saturation_are_counted(self, estimator: str) -> None:
         images = np.round(one_psf().images(np.zeros((6, 2)), (9, 9), 3000.0)).astype(np.uint16)
         images[0, 4, 4] = 65535

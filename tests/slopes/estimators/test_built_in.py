@@ -50,6 +50,7 @@ OPTIONS: dict[str, dict[str, Any]] = {
 }
 # The iterations of "tv" stop at a relative change of 1 %, where they have not yet made the image symmetric.
 CENTRE_TOLERANCE_PX = {"tv": 0.015}
+ONE_OF_EACH_FAMILY = ("brightest", "tv", "window", "weighted", "map", "power")
 
 
 class TestEveryEstimator(EstimatorTests):
@@ -62,8 +63,10 @@ class TestEveryEstimator(EstimatorTests):
         kind = example_estimator() if self.kind == "power" else estimators()[self.kind]
         return kind(**OPTIONS.get(self.kind, {}))
 
-    @pytest.mark.slow  # compiled anew at another SIMD width
+    @pytest.mark.slow
     def test_does_not_depend_on_grouping_threads_and_width(self) -> None:
+        if self.kind not in ONE_OF_EACH_FAMILY:
+            pytest.skip("compiled anew at another SIMD width, as another one of its family is")
         super().test_does_not_depend_on_grouping_threads_and_width()
 
 
