@@ -114,7 +114,8 @@ class TestBits:
     @pytest.mark.parametrize(("estimator", "noise_map"), ALL)
     def test_frames_whole_and_by_groups(self, estimator: str, noise_map: bool) -> None:
         pipeline = pipeline_of(estimator, TARGETS[native_target()].width, noise_map=noise_map)
-        kinds = ("uint16",) if noise_map else ("uint16", "float32")
+        # Each is compiled anew; how pixels are read is the same for all estimators.
+        kinds = ("uint16", "float32") if estimator == "brightest" else ("uint16",)
         library = exported(pipeline, f"{estimator}_{noise_map}", pixels=kinds)
         for kind in kinds:
             sensor, frames = sensor_of(library, kind), frames_of(pipeline, kind)

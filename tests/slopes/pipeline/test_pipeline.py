@@ -25,11 +25,11 @@ class TestAgainstOracle:
         assert_equals_oracle(case, case.pipeline()(case.frame))
 
     @pytest.mark.slow
-    @pytest.mark.parametrize("width", [4, 16])
-    def test_any_simd_width(self, width: int) -> None:
+    def test_the_widest_simd_width(self) -> None:
+        """At 4 lanes each family is compared with the usual width, which is compared above."""
         for seed in range(20):
             case = random_case(seed, "float32")
-            assert_equals_oracle(case, case.pipeline(width=width)(case.frame))
+            assert_equals_oracle(case, case.pipeline(width=16)(case.frame))
 
     def test_comparison_is_not_empty(self) -> None:
         """Most random sub-apertures hold a spot that is compared."""
