@@ -5,10 +5,12 @@ processes do not count. `python -m benchmarks.loaded TASK` lists the modules of 
 """
 
 import os
+import shutil
 import subprocess
 import sys
 import tempfile
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -52,6 +54,10 @@ layout = fs.Layout.grid((4, 4), pixels=16)
 frame = np.random.default_rng(1).poisson(2.0, layout.frame_shape).astype(np.float32)
 fs.SlopePipeline(layout, fs.Settings("tv", noise_std=0.5))(frame)
 """
+_SMALL_LOOP = """
+text = "[telescope]\\ndiameter_m = 1.8\\n[sensor]\\nsubapertures = 4\\npixels = 8\\nsamples = 9\\n"
+open("small.toml", "w").write(text + "[run]\\nframes = 60\\nsettle_frames = 20\\n")
+"""
 _LAYOUT = "layout frames.npy --grid 4x4 -o faintspot.toml"
 _SLOPES = "slopes frames.npy -o slopes.zarr"
 
@@ -73,7 +79,9 @@ TASKS = {
     "slopes of a recording": Task(_SLOPES, 11_000, (_FRAMES, _LAYOUT)),
     "telemetry": Task("telemetry slopes.zarr --frame-rate-hz 250", 13_000, (_FRAMES, _LAYOUT, _SLOPES)),
     "loop magnitude": Task(
-        "loop magnitude diffraction_limit --quick --methods brightest --flux-e 20 --workers 0", 15_700
+        "loop magnitude small.toml --quick --methods brightest --flux-e 20 --workers 0",
+        15_700,
+        (_SMALL_LOOP,),
     ),
     "realtime run": Task(
         "realtime run --frames 20 --name {name}",
@@ -90,14 +98,28 @@ def _arguments(run: str, first: str = "") -> list[str]:
     return [sys.executable, "-c", first + code]
 
 
-def loaded(task: Task) -> dict[str, int]:
-    """Return the lines of each module that a task loads."""
+def _options(folder: str) -> dict[str, Any]:
+    """Return how a process runs in a folder."""
     root = Path(__file__).parents[1] / "src"
     quiet: dict[str, Any] = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    return {"cwd": folder, "env": os.environ | {"PYTHONPATH": str(root)}, **quiet}
+
+
+@cache
+def _made(before: tuple[str, ...]) -> tempfile.TemporaryDirectory[str]:
+    """Return a folder with the files that commands make, each of them run once."""
+    folder = tempfile.TemporaryDirectory()
+    if before:
+        shutil.copytree(_made(before[:-1]).name, folder.name, dirs_exist_ok=True)
+        subprocess.run(_arguments(before[-1]), check=True, **_options(folder.name))
+    return folder
+
+
+def loaded(task: Task) -> dict[str, int]:
+    """Return the lines of each module that a task loads."""
     with tempfile.TemporaryDirectory() as folder:
-        options = {"cwd": folder, "env": os.environ | {"PYTHONPATH": str(root)}, **quiet}
-        for run in task.before:
-            subprocess.run(_arguments(run), check=True, **options)
+        options = _options(folder)
+        shutil.copytree(_made(task.before).name, folder, dirs_exist_ok=True)
         beside = subprocess.Popen(_arguments(task.beside), **options) if task.beside else None
         try:
             subprocess.run(_arguments(task.run, _COUNT), check=True, **options)
