@@ -58,6 +58,7 @@ def test_changes_between_two_frames_build_on_each_other(live: RunningSettings[fs
         (100, {"keep_brightest": 20}, [1, 4]),
         (100, {"noise_std": 3.0}, [0]),
     ]
+    assert [number for _, number, _, _ in live.taken(after=1)] == [2, 3]
     np.testing.assert_array_equal(pipeline.settings.values("noise_std", N, 64), [3, 2.5, 2.5, 2.5, 2.5, 2.5])
     assert live.get(["keep_brightest"]) == {"keep_brightest": [9, 20, 9, 9, 20, 9]}
 

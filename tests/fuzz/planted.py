@@ -72,12 +72,15 @@ def _outcome(fault: Fault, *, plant: bool, slow: bool) -> str:
     if plant:
         target.write_text(target.read_text(encoding="utf-8").replace(fault.old, fault.new), encoding="utf-8")
     try:
-        outcome, by = "", ""
+        seen = []
         for kind in ("fast", "slow") if slow else ("fast",):
             outcome, by = _tested(fault, kind)
+            seen.append(outcome)
             if outcome == "found":
-                outcome = f"found by {kind} tests"
+                seen = [f"found by {kind} tests"]
                 break
+        # Where one kind has no tests, the other one tells.
+        outcome = next((each for each in ("not decided", "missed") if each in seen), seen[0])
     finally:
         shutil.copy2(SOURCES / fault.file, target)
     print(f"{fault.name:40} {outcome:20} {time.monotonic() - begin:4.0f} s  {by}", flush=True)

@@ -106,6 +106,7 @@ class Clients(RuleBasedStateMachine):
         self.newest.pop(kind, None)
         self.server.latest_messages.forget(kind)
 
+    @precondition(lambda self: len(self.clients) < 3)
     @rule()
     def come(self) -> None:
         client = Played(self.server)
@@ -128,6 +129,7 @@ class Clients(RuleBasedStateMachine):
         if said.get("token") is True:
             said["token"] = self.server.access.token
         greets, is_right = said["do"] == "hello" or not client.is_greeted, words == "right"
+        is_new = not client.is_greeted
         if greets:
             may = is_right or not self.private
             client.is_greeted |= may
@@ -142,6 +144,8 @@ class Clients(RuleBasedStateMachine):
         assert client.answers[-1]["ok"] == is_well
         assert len(self.noted.asked) == self.wishes
         assert client.is_closed == (not client.is_greeted)
+        if is_new and client.is_greeted and not client.lags:
+            assert client.numbers == sorted(self.newest.values())
         if client.is_closed:
             self.clients.remove(client)
 
@@ -200,5 +204,5 @@ def test_clients_get_the_newest_messages_and_change_with_the_token_alone(
     for name in ("_WRONG_TOKEN_S", "_PAUSE_S"):
         monkeypatch.setattr(server_module, name, 0.0)
     monkeypatch.setattr(server_module, "_in_thread", at_once)
-    examples = settings().max_examples * 20 // USUAL_EXAMPLES
+    examples = settings().max_examples * 60 // USUAL_EXAMPLES
     run_state_machine_as_test(Clients, settings=settings(max_examples=examples, stateful_step_count=25))

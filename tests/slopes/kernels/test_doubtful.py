@@ -92,11 +92,13 @@ class TestSecondSpots:
         assert (arrays.flags[0] != 0).tolist() == [flagged and s == middle for s in range(N)]
 
 
-def test_spots_between_wrong_ones_stay_valid() -> None:
+@pytest.mark.parametrize("defocus_px", [0.0, 1.0])
+def test_spots_between_wrong_ones_stay_valid(defocus_px: float) -> None:
     """Each of its four lines has a wrong spot; those that it continues on one side have none."""
     arrays = SlopeArrays(*(np.zeros((1, N), kind) for kind in RESULT_TYPES))
+    arrays.y[0], arrays.x[0] = defocus_px * (LAYOUT.cells - 5.5).T
     wrong = [number_of(*cell) for cell in ((5, 6), (6, 5), (5, 5), (5, 7))]
-    arrays.x[0, wrong] = 5.0, -4.0, 3.0, -6.0
+    arrays.x[0, wrong] += 5.0, -4.0, 3.0, -6.0
     pipeline = fs.SlopePipeline(LAYOUT, fs.Settings("brightest"))
     pipeline.flag_doubtful(arrays, np.zeros((1, *LAYOUT.frame_shape), np.float32))
     assert np.flatnonzero(arrays.flags[0]).tolist() == sorted(wrong)

@@ -113,8 +113,8 @@ def test_controller_from_a_file_does_the_same(tip_tilt: PredictiveControl, tmp_p
 
 def test_a_controller_is_its_model_whatever_comes(tip_tilt: PredictiveControl) -> None:
     machine = type("TipTilt", (Controls,), {"learnt": tip_tilt})
-    examples = settings().max_examples * 10 // USUAL_EXAMPLES
-    run_state_machine_as_test(machine, settings=settings(max_examples=examples, stateful_step_count=15))
+    examples = settings().max_examples * 25 // USUAL_EXAMPLES
+    run_state_machine_as_test(machine, settings=settings(max_examples=examples, stateful_step_count=10))
 
 
 def test_slopes_that_are_not_measured(tip_tilt: PredictiveControl) -> None:
