@@ -156,6 +156,7 @@ def test_exists_already_and_overwrite_keeps_calibration_and_scales(folder: Path,
     assert kept == Calibration(dark=90.0, gain_e_per_adu=2.0)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("only_found")
 def test_dark_frames_give_the_noise_of_each_pixel(folder: Path, run: Commands) -> None:
     """Variances of 40 darks are known to 23 %; bad pixels that are known stay, those that blink join them."""
@@ -375,6 +376,7 @@ def test_what_was_estimated_is_estimated_again_and_what_is_stated_stays(folder: 
     assert "read_noise_e 3" in result.out
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("only_found")
 def test_doubts_are_repeated_until_they_are_accepted(folder: Path, run: Commands) -> None:
     np.save("a.npy", defocused(1.0))

@@ -79,6 +79,7 @@ def test_spots_are_exposed_and_measured_in_photo_electrons() -> None:
         np.testing.assert_allclose(y, alone.y, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_tv_is_not_recommended_for_gaussian_spots_without_read_noise() -> None:
     answer = answered(read_noise_e=0.1, profile="gaussian", fwhm_px=2.0, flux_e=100.0)
     assert answer.best.method.name != "tv"

@@ -132,6 +132,7 @@ def test_store_is_memory(tmp_path: Path) -> None:
     np.testing.assert_array_equal(opened["error"], dataset_of(SPECIFICATION, memory)["error"])
 
 
+@pytest.mark.slow
 def test_what_is_no_study_of_this_version_is_refused(tmp_path: Path) -> None:
     (tmp_path / "folder").mkdir()
     for wrong, found in (("folder", "something else"), ("nothing", "nothing")):

@@ -142,6 +142,7 @@ def test_open_loop_control() -> None:
     assert np.std(corrected.slopes_px[30:]) > 0.7 * np.std(corrected.slopes_px[:3])
 
 
+@pytest.mark.slow
 def test_centroid_gain_falls_with_noise_and_brightest_pixels() -> None:
     loop, gains = faint(), []
     for photons, noise, kept in ((1e5, 0.0, 255), (200.0, 1.0, 80), (200.0, 3.0, 20)):
@@ -154,6 +155,7 @@ def test_centroid_gain_falls_with_noise_and_brightest_pixels() -> None:
     assert gains[0] > gains[1] > gains[2] > 0.05
 
 
+@pytest.mark.slow
 def test_gain_correction_makes_a_loop_of_low_gain_as_fast() -> None:
     loop = faint().replace("camera", read_noise_e=3.0, photons_per_subaperture=400.0)
     loop = loop.replace("run", frames=100, settle_frames=40)

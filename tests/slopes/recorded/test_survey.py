@@ -62,6 +62,7 @@ def test_response_of_moving_speckled_spots(width_px: float) -> None:
     assert shown.mean() < 0.95
 
 
+@pytest.mark.slow
 def test_response_is_the_regression_of_slopes_on_displacements() -> None:
     """Within 5 % for spots so faint that some are lost."""
     layout = fs.Layout.grid((2, 2), pixels=SIDE, origin=(4, 4), frame_shape=(2 * SIDE + 8, 2 * SIDE + 8))

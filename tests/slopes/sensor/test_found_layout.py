@@ -138,6 +138,7 @@ def structured(kind: str, geometry: str, seed: int) -> tuple[NDArray[np.float64]
     return spot_frame(at, (size, size), flux_e=900.0, width_px=1.0, background_e=30.0, seed=seed), len(nodes)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("geometry", mostly_slow(1, ["square", "hexagonal"]))
 @pytest.mark.parametrize("kind", ["grid", "anywhere"])
 def test_the_lattice_is_not_that_of_the_structure_in_the_spots(kind: str, geometry: str) -> None:

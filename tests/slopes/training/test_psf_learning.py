@@ -127,6 +127,7 @@ def static(rng: Any, spread_px: Any) -> Any:
     return images.astype(np.float32)
 
 
+@pytest.mark.slow
 def test_spots_at_one_phase_teach_nothing() -> None:
     rng = np.random.default_rng(11)
     with refused("one for each PSF"):

@@ -65,6 +65,7 @@ def test_sizes_are_those_of_the_lit_part() -> None:
     assert found.rms.value == pytest.approx(radius * 2 * np.sqrt(3) * 0.75 / np.sqrt(12), rel=0.1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("frames", "reference"), mostly_slow(1, [(1, 0), (3, 6)]))
 def test_rms_intervals_hold(frames: int, reference: int) -> None:
     """Sizes from 0 to far above the noise: of 40 intervals, 5 misses or fewer have a probability of 99 %."""

@@ -44,6 +44,7 @@ def test_frames_without_slopes_are_gaps() -> None:
         measured_delay(replace(loop, slopes=slopes))
 
 
+@pytest.mark.slow
 def test_lost_frames_here_and_there_change_neither_delay_nor_gain() -> None:
     """Of every 20 frames one is lost, and numbered; true are 2 frames and a gain of 1."""
     loop = recorded().part(slice(0, 1500))

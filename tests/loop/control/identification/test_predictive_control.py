@@ -233,6 +233,7 @@ def test_the_fallback_has_the_matrix_that_ran() -> None:
     np.testing.assert_array_equal(plants[0].reconstructor.clean, plants[1].reconstructor.clean)
 
 
+@pytest.mark.slow
 def test_stroke_is_what_the_flat_command_leaves(recording: Recording) -> None:
     """No command is beyond the limit of the recording, whatever the slopes are."""
     rms = float(recording.commands.std())

@@ -238,6 +238,7 @@ def test_it_begins_with_given_slopes_and_looks_ahead(arrays: dict[str, Any]) -> 
         predictor.advance()
 
 
+@pytest.mark.slow
 def test_large_sensors_learn_it(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """Learnt, saved and read again it sends the same commands, and leaves less than the integrator."""
     monkeypatch.setattr(models, "MOST_SLOPES", 10)

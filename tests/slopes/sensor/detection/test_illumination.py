@@ -116,6 +116,7 @@ def test_faint_spots_are_doubtful() -> None:
     assert false < 0.05 * np.count_nonzero(faint.illuminated)
 
 
+@pytest.mark.slow
 def test_illuminated_fraction_is_strict_and_of_the_median() -> None:
     truth = Sensor(3, lenslets=14, scatter=0.4)
     frame = truth.frame()
