@@ -90,12 +90,19 @@ def in_loop(control: PredictiveControl, turbulence: np.ndarray, rng: np.random.G
     return np.array(left)
 
 
+@pytest.fixture(scope="module")
+def stored(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A controller that was learnt from the recording."""
+    path = tmp_path_factory.mktemp("learnt") / "controller.npz"
+    learn(recorded()).save(path)
+    return path
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("how", ["asked", "background"])
-def test_another_wind_is_learnt_from_the_running_loop(how: str, tmp_path: Path) -> None:
+def test_another_wind_is_learnt_from_the_running_loop(how: str, stored: Path) -> None:
     """Winds faster by 1.6 and turned by a quarter: the filter that knows them leaves at least 10 % less."""
-    learn(recorded()).save(tmp_path / "controller.npz")
-    control, rng = PredictiveControl.load(tmp_path / "controller.npz"), np.random.default_rng(12)
+    control, rng = PredictiveControl.load(stored), np.random.default_rng(12)
     turned = replace(AIR, wind_m_per_s=1.6 * AIR.wind_m_per_s @ np.array([[0.0, 1.0], [-1.0, 0.0]]))
     turbulence = frozen_slopes(turned, 2200, RATE_HZ, rng)
     if how == "background":
