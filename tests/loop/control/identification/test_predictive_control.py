@@ -112,7 +112,9 @@ def test_a_dead_sub_aperture_costs_little(recording: Recording, control: Predict
     dead = learn(replace(recording, slopes=slopes))
     assert dead.left_out.tolist() == [12]
     assert "sub-aperture 12 (row 2, column 2)" in dead.summary()
-    assert dead.centroid_gain.value == pytest.approx(control.centroid_gain.value, rel=0.05)
+    # 24 of 25 sub-apertures are the same: half a standard error.
+    gain = control.centroid_gain
+    assert dead.centroid_gain.value == pytest.approx(gain.value, abs=0.5 * gain.error)
     sent = commands(dead, recording.slopes[:200])
     assert np.isfinite(sent).all()
     wild = recording.slopes[:200].copy()
