@@ -40,7 +40,7 @@ unit: $(VENV)/installed
 VERSIONED := tests/test_public.py tests/test_docstrings.py tests/base tests/slopes/kernels/test_compiling.py \
 	tests/slopes/camera tests/io/test_frame_formats.py tests/io/test_slope_files.py tests/test_estimators_hostile.py
 
-newest: $(VENV)/installed  ## the tenth of the fast tests that may differ between versions of Python
+newest: $(VENV)/installed  ## the fast tests that may differ between versions of Python
 	$(BIN)/python -m pytest -n 2 --dist worksteal -m "not slow" $(VERSIONED)
 
 optimised: $(VENV)/installed  ## inputs are checked without the assert statements that `python -O` leaves out

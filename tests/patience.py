@@ -6,6 +6,7 @@ from typing import Any
 
 import pytest
 from hypothesis import settings
+from hypothesis.stateful import RuleBasedStateMachine, run_state_machine_as_test
 
 LIMIT_S = 60.0
 """How long to wait for what must come."""
@@ -17,6 +18,11 @@ USUAL_EXAMPLES = 15
 def examples(count: int) -> settings:
     """Try `count` examples instead of the usual number, and as many times more as the profile does."""
     return settings(max_examples=count * settings().max_examples // USUAL_EXAMPLES)
+
+
+def try_states(machine: type[RuleBasedStateMachine], count: int, steps: int) -> None:
+    """Run a state machine `count` times as for `examples`, with at most so many steps."""
+    run_state_machine_as_test(machine, settings=settings(examples(count), stateful_step_count=steps))
 
 
 def wait_for(condition: Any, what: object = "", step: Any = lambda: time.sleep(0.001)) -> None:

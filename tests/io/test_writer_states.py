@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import (
     RuleBasedStateMachine,
@@ -14,10 +13,9 @@ from hypothesis.stateful import (
     invariant,
     precondition,
     rule,
-    run_state_machine_as_test,
 )
 from tests.io.slope_files import assert_stored, part, result, store_of, writer_for
-from tests.patience import USUAL_EXAMPLES
+from tests.patience import try_states
 from tests.refusals import refused
 
 from faintspot.io import SlopeWriter, read_slopes, slopes_writer
@@ -110,5 +108,4 @@ class SlopeFiles(RuleBasedStateMachine):
 def test_slope_files_are_what_was_appended(monkeypatch: pytest.MonkeyPatch, mark_s: float) -> None:
     monkeypatch.setattr(zarr_files, "_CHUNK_NUMBERS", 70)
     monkeypatch.setattr(slopes_writer, "_MARK_SECONDS", mark_s)
-    examples = settings().max_examples * 5 // USUAL_EXAMPLES
-    run_state_machine_as_test(SlopeFiles, settings=settings(max_examples=examples, stateful_step_count=12))
+    try_states(SlopeFiles, 5, 12)

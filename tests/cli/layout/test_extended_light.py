@@ -42,7 +42,7 @@ def test_reflection_spoils_no_settings_and_slopes(folder: Path, run: Commands, r
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", mostly_slow(1, [1, 2]))
+@pytest.mark.parametrize("seed", [1, 2])
 def test_defaults_in_eyes(folder: Path, run: Commands, seed: int) -> None:
     """Scaled median deviations, of narrow centroids 0.57 px: a few lenslets have reflections for spots."""
     pixels, spots = eye_frame(seed)
@@ -100,7 +100,7 @@ def test_flat_field_corrects_a_colour_mosaic(folder: Path, run: Commands) -> Non
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("no_trials")
-@pytest.mark.parametrize("kind", mostly_slow(1, ["offset", "pattern", "with light"]))
+@pytest.mark.parametrize("kind", ["offset", "pattern", "with light"])
 def test_a_dark_never_makes_a_layout_worse(folder: Path, run: Commands, kind: str) -> None:
     """The same windows as without a dark, except for single ones at the pupil's edge."""
     pixels, spots = eye_frame(1)

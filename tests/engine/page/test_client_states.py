@@ -6,7 +6,6 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import (
     RuleBasedStateMachine,
@@ -14,10 +13,9 @@ from hypothesis.stateful import (
     invariant,
     precondition,
     rule,
-    run_state_machine_as_test,
 )
 from tests.engine.page.cases import Noted
-from tests.patience import USUAL_EXAMPLES
+from tests.patience import try_states
 from tornado.websocket import WebSocketClosedError
 
 from faintspot.engine.page import server as server_module
@@ -204,5 +202,4 @@ def test_clients_get_the_newest_messages_and_change_with_the_token_alone(
     for name in ("_WRONG_TOKEN_S", "_PAUSE_S"):
         monkeypatch.setattr(server_module, name, 0.0)
     monkeypatch.setattr(server_module, "_in_thread", at_once)
-    examples = settings().max_examples * 60 // USUAL_EXAMPLES
-    run_state_machine_as_test(Clients, settings=settings(max_examples=examples, stateful_step_count=25))
+    try_states(Clients, 60, 25)

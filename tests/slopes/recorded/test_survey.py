@@ -5,7 +5,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tests.patience import mostly_slow
 
 import faintspot as fs
 from faintspot.io.frames import open_frames
@@ -50,7 +49,7 @@ def movie(shift_px: float) -> np.ndarray:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("width_px", mostly_slow(1, [2.5, 5.0]))
+@pytest.mark.parametrize("width_px", [2.5, 5.0])
 def test_response_of_moving_speckled_spots(width_px: float) -> None:
     """Within 4 % of what a displacement of all frames shows: its finite step, and speckles that differ."""
     layout = fs.Layout.stacked(N, (SIDE, SIDE))

@@ -147,11 +147,8 @@ class Page:
 
     def step(self) -> None:
         """Read the source once and send updates."""
-        try:
-            batch = self.source.read()
-            state = self.source.state()
-        except InputError as error:  # a damaged recording
-            batch, state = None, {**self.source.state(), "error": str(error)}
+        batch = self.source.read()
+        state = self.source.state()
         if batch is not None:
             if batch.anew or self._drawing is None:
                 self._begin()
@@ -167,7 +164,7 @@ class Page:
             self._tell("place", packed("place", state))
 
     def _begin(self) -> None:
-        """Clear data of another engine, or of another part of the recording."""
+        """Clear data of another engine."""
         layout = not_none(self.source.layout)
         self.page_state = PageState(self.source.methods)
         if self._drawing is None or self._drawing.layout is not layout:

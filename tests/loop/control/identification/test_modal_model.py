@@ -5,8 +5,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import settings
-from hypothesis.stateful import run_state_machine_as_test
 from scipy.signal import lfilter
 from tests.loop.control.control_states import Controls
 from tests.loop.control.modal_cases import (
@@ -17,7 +15,7 @@ from tests.loop.control.modal_cases import (
     recorded,
     wandering,
 )
-from tests.patience import USUAL_EXAMPLES
+from tests.patience import try_states
 
 from faintspot.base.errors import InputError
 from faintspot.loop.control.base import CommandDelayLine
@@ -112,9 +110,7 @@ def test_controller_from_a_file_does_the_same(tip_tilt: PredictiveControl, tmp_p
 
 
 def test_a_controller_is_its_model_whatever_comes(tip_tilt: PredictiveControl) -> None:
-    machine = type("TipTilt", (Controls,), {"learnt": tip_tilt})
-    examples = settings().max_examples * 25 // USUAL_EXAMPLES
-    run_state_machine_as_test(machine, settings=settings(max_examples=examples, stateful_step_count=10))
+    try_states(type("TipTilt", (Controls,), {"learnt": tip_tilt}), 25, 10)
 
 
 def test_slopes_that_are_not_measured(tip_tilt: PredictiveControl) -> None:

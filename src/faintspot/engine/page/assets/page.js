@@ -81,7 +81,7 @@ function showState() {
   say("name", place.name);
   document.title = `${place.name} · faintspot`;
   const trouble = !connected ? "The server does not answer; check that faintspot live is running."
-    : place.error || status?.source_refused || status?.estimator_fault || (there && status?.error) || "";
+    : status?.source_refused || status?.estimator_fault || (there && status?.error) || "";
   byId("trouble").hidden = !trouble;
   say("trouble", trouble);
 }
