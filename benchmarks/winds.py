@@ -16,7 +16,7 @@ from faintspot.engine.guard import ControllerSuccessor, PreparedController
 from faintspot.loop.control.base import ASSUMED, WINDS, CommandDelayLine, Controller
 from faintspot.loop.control.identification.learning import RelearntControl, relearn
 from faintspot.loop.control.identification.model import Kalman
-from faintspot.loop.control.kalman.guarded import HANDOVER_FRAMES
+from faintspot.loop.control.kalman.guard import HANDOVER_FRAMES
 
 CASES = {
     "diffraction_limit, 20 photons": Case(20.0, 0.0),

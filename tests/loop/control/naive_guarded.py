@@ -13,7 +13,8 @@ from faintspot.loop.control.base import (
     as_estimated,
     without_prior,
 )
-from faintspot.loop.control.kalman.guarded import SURPRISE, GuardedController
+from faintspot.loop.control.kalman.guard import SURPRISE
+from faintspot.loop.control.kalman.guarded import GuardedController
 from faintspot.loop.control.kalman.predictor import LARGEST_VARIANCE_PX2
 
 Floats = NDArray[np.float64]
@@ -80,7 +81,9 @@ class Guarded(GuardedController):
             surprise = open_loop + self._interaction @ self._lines[0].acting - learnt.mean_px
             in_deviations = np.square(surprise) / (np.square(learnt.std_px) + np.square(error))
             measured = np.square(error) < LARGEST_VARIANCE_PX2
-            self._guard[SURPRISE] = in_deviations[measured].sum() / max(1, np.count_nonzero(measured))
+            self._guard["measures"][SURPRISE] = in_deviations[measured].sum() / max(
+                1, np.count_nonzero(measured)
+            )
         variances = []
         for controller, line in zip(self._controllers, self._lines, strict=True):
             residual = open_loop + self._interaction @ line.acting

@@ -11,7 +11,7 @@ from tests.loop.control.naive_guarded import Guarded
 
 from faintspot.loop.control.base import CommandDelayLine
 from faintspot.loop.control.kalman.compiled import STEPS, CompiledKalman, Predictive
-from faintspot.loop.control.kalman.guarded import HANDOVER_FRAMES
+from faintspot.loop.control.kalman.guard import HANDOVER_FRAMES
 from faintspot.loop.control.kalman.predictor import SlopeModel, SlopePredictor
 
 M, COMMANDS = INTERACTION.shape

@@ -7,7 +7,7 @@ from tests.loop.control.naive_guarded import Guarded
 
 from faintspot.loop.control.base import CommandDelayLine, Controller
 from faintspot.loop.control.integrator import Make
-from faintspot.loop.control.kalman.guarded import EXCESS, MOST_EXCESS
+from faintspot.loop.control.kalman.guard import MOST_EXCESS
 
 FRAMES = telemetry(900, 0.2)
 
@@ -33,7 +33,7 @@ def test_after_a_failure_the_plain_controller_continues_from_the_mirrors_command
     for number, slopes in enumerate(FRAMES.open_loop_px[:15]):
         if number == 10:
             assert np.abs(plain.latest - line.latest).max() > 0.1
-            guarded._guard[EXCESS] = 2 * MOST_EXCESS
+            guarded._guard["excess"] = 2 * MOST_EXCESS
         guarded.update(slopes + INTERACTION @ line.acting, np.full(18, 0.2))
         if number >= 10:
             assert guarded.chosen == 1

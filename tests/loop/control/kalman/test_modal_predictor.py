@@ -20,7 +20,8 @@ from tests.loop.control.naive_guarded import Guarded
 from faintspot.loop.control import integrator
 from faintspot.loop.control.base import CommandDelayLine
 from faintspot.loop.control.kalman.compiled import Predictive
-from faintspot.loop.control.kalman.guarded import EXCESS, MOST_EXCESS, GuardedController
+from faintspot.loop.control.kalman.guard import MOST_EXCESS
+from faintspot.loop.control.kalman.guarded import GuardedController
 from faintspot.loop.control.kalman.local_predictor import LocalPredictor, local_filter
 from faintspot.loop.control.kalman.modal_predictor import (
     LAGS,
@@ -160,7 +161,7 @@ def test_it_does_the_same_before_and_after_the_integrator_takes_over(
         error: np.ndarray = np.where(rng.random(M) < 0.1, np.inf, 0.3 * rng.uniform(0.5, 1.5, M))
         if fails and number == 10:
             for controller in controllers:
-                controller._guard[EXCESS] = 2 * MOST_EXCESS
+                controller._guard["excess"] = 2 * MOST_EXCESS
         if number == 200:
             for controller, line in zip(controllers, lines, strict=True):
                 line.hold(np.full(COMMANDS, 0.1))

@@ -14,7 +14,7 @@ from faintspot.loop.control.base import (
     Predictor,
 )
 from faintspot.loop.control.integrator import LoopPlant
-from faintspot.loop.control.kalman.guarded import CHOSEN, GuardedController
+from faintspot.loop.control.kalman.guarded import GuardedController
 from faintspot.loop.control.kalman.kernels import (
     COMMAND_ROWS,
     FOLLOW,
@@ -113,7 +113,7 @@ class CompiledKalman(GuardedController):
         """See `Controller`."""
         self.complete()
         rows = self._memory.slopes
-        if self._guard[CHOSEN]:
+        if self._chosen:
             return ExpectedSlopes(rows[HELD] - rows[LATEST_PLAIN], None)
         return ExpectedSlopes(rows[HELD] + rows[PREDICTED], self._std_px)
 

@@ -1,7 +1,6 @@
 """Kernels of the guarded Kalman filter: command from a frame's slopes, then the rest of the update.
 
-What they do is written in NumPy in `guarded`, `predictive`, `predictor` and `base`; `compiled` calls them in
-their order.
+`guarded`, `predictor` and `base` have the same steps in NumPy; `compiled` calls the kernels in their order.
 """
 
 import math
@@ -14,15 +13,13 @@ import numpy as np
 from faintspot.loop.control import integrator
 from faintspot.loop.control.base import LEAST_SHARE, LEAST_VARIANCE_PX2
 from faintspot.loop.control.integrator import integrate_wavefront
-from faintspot.loop.control.kalman import guarded
-from faintspot.loop.control.kalman.guarded import (
+from faintspot.loop.control.kalman import guard as guard_rule
+from faintspot.loop.control.kalman.guard import (
     AT_LIMIT,
-    BLENDED,
-    CHOSEN,
-    EXCESS,
     HANDOVER_FRAMES,
+    INTEGRATOR,
     MOST_EXCESS,
-    SENT,
+    RESIDUAL,
     SURPRISE,
     choose,
 )
@@ -76,7 +73,7 @@ class Memory(NamedTuple):
     state: Any
     """(layers, 2, m): predicted state of the next frame."""
     guard: Any
-    """(GUARD_NUMBERS,)"""
+    """() array of `GUARD`."""
     slopes: Any
     """(SLOPE_ROWS, m)"""
     commands: Any
@@ -112,7 +109,7 @@ class Recorded(NamedTuple):
 
 
 # Compiled anew when guard or integrator change, too.
-_SOURCES = __file__, guarded.__file__, integrator.__file__
+_SOURCES = __file__, guard_rule.__file__, integrator.__file__
 _compiled = partial(_kernel, sources=tuple(map(Path, _SOURCES)))
 
 
@@ -243,18 +240,18 @@ def _integrate(matrices: Any, memory: Any, gain: Any, keep: Any, largest: Any, c
 @_compiled
 def _send(command: Any, true: Any, row: Any, memory: Any, largest: Any) -> None:
     """Write the mirror's command; see `GuardedController`."""
-    guard, offset = memory.guard, memory.commands[OFFSET]
-    if guard[SENT] != guard[CHOSEN]:
-        guard[SENT], guard[BLENDED] = guard[CHOSEN], HANDOVER_FRAMES
+    guard, offset = memory.guard[()], memory.commands[OFFSET]
+    if guard.sent != guard.chosen:
+        guard.sent, guard.blended = guard.chosen, HANDOVER_FRAMES
         for c in range(command.shape[0]):
             offset[c] = true[row - 1, c] - command[c]
-    guard[BLENDED] = max(0.0, guard[BLENDED] - 1.0)
-    share = guard[BLENDED] / HANDOVER_FRAMES
-    guard[AT_LIMIT] = 0.0
+    guard.blended = max(0, guard.blended - 1)
+    share = guard.blended / HANDOVER_FRAMES
+    guard.measures[AT_LIMIT] = 0.0
     for c in range(command.shape[0]):
         true[row, c] = min(max(command[c] + share * offset[c], -largest[c]), largest[c])
         if abs(true[row, c]) >= largest[c]:
-            guard[AT_LIMIT] += 1.0
+            guard.measures[AT_LIMIT] += 1.0
 
 
 @_compiled
@@ -309,9 +306,10 @@ def follow(frame: Any, numbers: Any, matrices: Any, lines: Any, next_rows: Any, 
     """
     row, of_learnt, of_plain = next_rows
     gain, keep, largest, steps = numbers
-    plainly = memory.guard[CHOSEN] > 0.0
+    guard = memory.guard[()]
+    plainly = guard.chosen == INTEGRATOR
     _take(frame, memory.slopes, plainly)
-    memory.guard[SURPRISE] = _failure(matrices, memory.slopes)
+    guard.measures[SURPRISE] = _failure(matrices, memory.slopes)
     if plainly:
         total: float = _integrate(matrices, memory, gain, keep, largest, lines.plain[of_plain])
     else:
@@ -328,7 +326,8 @@ def go_on(numbers: Any, matrices: Any, lines: Any, next_rows: Any, memory: Any) 
     """
     _, of_learnt, of_plain = next_rows
     gain, keep, largest, steps = numbers
-    if memory.guard[CHOSEN] > 0.0:
+    guard = memory.guard[()]
+    if guard.chosen == INTEGRATOR:
         total: float = _filter(matrices, memory, steps, largest, lines.learnt[of_learnt])
     else:
         total = _integrate(matrices, memory, gain, keep, largest, lines.plain[of_plain])
@@ -339,16 +338,17 @@ def go_on(numbers: Any, matrices: Any, lines: Any, next_rows: Any, memory: Any) 
     for c in range(wavefronts.shape[1]):
         learnt += wavefronts[0, c] * wavefronts[0, c]
         plain += wavefronts[1, c] * wavefronts[1, c]
-    was_chosen = memory.guard[CHOSEN]
+    was_chosen = guard.chosen
     choose(memory.guard, learnt, plain)
-    if memory.guard[CHOSEN] > was_chosen and memory.guard[EXCESS] > MOST_EXCESS:
-        _adopt(lines, next_rows, memory.guard)
+    if guard.chosen > was_chosen and guard.excess[RESIDUAL] > MOST_EXCESS:
+        _adopt(lines, next_rows)
+        guard.sent, guard.blended = INTEGRATOR, 0
     _advance(matrices, memory)
     return total
 
 
 @_compiled
-def _adopt(lines: Any, next_rows: Any, guard: Any) -> None:
+def _adopt(lines: Any, next_rows: Any) -> None:
     """Let the integrator continue from the mirror's commands; the row of its own is not yet sent."""
     row, _, of_plain = next_rows
     length = lines.true.shape[0]
@@ -356,7 +356,6 @@ def _adopt(lines: Any, next_rows: Any, guard: Any) -> None:
         to, of = (of_plain + 1 + later) % length, (row + later) % length
         for c in range(lines.true.shape[1]):
             lines.plain[to, c] = lines.true[of, c]
-    guard[SENT], guard[BLENDED] = 1.0, 0.0
 
 
 @_compiled

@@ -16,7 +16,8 @@ from scipy.signal import lfilter
 
 from faintspot.loop.control.base import CommandDelayLine, ExpectedSlopes, without_prior
 from faintspot.loop.control.integrator import LoopPlant, SlopeProduct
-from faintspot.loop.control.kalman.guarded import SURPRISE, GuardedController
+from faintspot.loop.control.kalman.guard import SURPRISE
+from faintspot.loop.control.kalman.guarded import GuardedController
 from faintspot.loop.control.kalman.local_predictor import LocalPredictor
 from faintspot.loop.control.kalman.predictor import LARGEST_VARIANCE_PX2
 from faintspot.slopes.kernels.products import ProductPart
@@ -346,7 +347,7 @@ class LargeGuarded(GuardedController):
         frame, self._frame = self._frame, None
         if frame is not None:
             learnt, plain = self._compare.several(*self._follow_up(frame))
-            self._guard[SURPRISE] = self._predictor.failure(frame.surprise, frame.variance)
+            self._guard["measures"][SURPRISE] = self._predictor.failure(frame.surprise, frame.variance)
             self._predictor.correct(frame.open_loop, frame.variance)
             self._predictor.advance()
             if self._choose(float(learnt @ learnt), float(plain @ plain)):
