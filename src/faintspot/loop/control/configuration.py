@@ -24,11 +24,10 @@ from faintspot.loop.control.options import (
     NONE,
     STREAM,
     TABLE,
-    TIP_TILT_FOCUS,
     ControlOptions,
-    RemovedModes,
 )
 from faintspot.loop.control.reconstructor import Reconstructor, make_reconstructor
+from faintspot.loop.control.removed_modes import TIP_TILT_FOCUS, RemovedModes
 from faintspot.slopes.camera.calibration import Calibration
 from faintspot.slopes.pipeline.configuration import Configuration
 from faintspot.slopes.pipeline.settings import Settings

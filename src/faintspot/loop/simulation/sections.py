@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from faintspot.base.options import FLAG, LIST, NUMBER_OR_LIST, number, setting
 from faintspot.base.tables import ConfigurationTable
 from faintspot.loop.control.base import LEARNT, WINDS
+from faintspot.loop.control.options import IntegratorOptions
 from faintspot.slopes.simulate.photometry import StarLight
 
 CLOSED, OPEN = "closed", "open"
@@ -86,19 +87,13 @@ class Camera(StarLight, ConfigurationTable, table="camera"):
 
 
 @dataclass(frozen=True)
-class ControlParameters(ConfigurationTable, table="control"):
+class ControlParameters(IntegratorOptions, ConfigurationTable):
     """Control loop."""
 
     frame_rate_hz: float = number(250.0, 0.0, 1e5, low_open=True)
-    delay_frames: int = number(2, 1, 100, whole=True)
-    """The command computed from frame k acts first during the exposure of frame k + delay_frames."""
     gain: float = number(0.5, 0.0, 2.0)
-    leak: float = number(0.01, 0.0, 1.0)
-    """Fraction by which commands decay in each frame, so that a loop recovers after it lost the star."""
     mode: str = setting(CLOSED, choices=(CLOSED, OPEN))
     """"closed", or "open": the sensor does not see the mirror."""
-    largest_condition: float = number(30.0, 1.0, 1e6)
-    """Largest condition number of the reconstructor; weaker modes are not controlled."""
     telemetry_frames: int = number(2000, 260, 1_000_000, whole=True)
     """Length of the closed loop with an integrator from which other controllers learn; never scored."""
     winds: str = setting(LEARNT, choices=WINDS)

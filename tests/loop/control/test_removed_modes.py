@@ -13,7 +13,8 @@ from faintspot.base.flags import SubapertureFlag
 from faintspot.engine.control_loop import ControlLoop
 from faintspot.loop.control.configuration import Control, load_control, save_control
 from faintspot.loop.control.integrator import MEAN_SQUARE
-from faintspot.loop.control.options import ControlOptions, RemovedModes
+from faintspot.loop.control.options import ControlOptions
+from faintspot.loop.control.removed_modes import RemovedModes
 from faintspot.slopes.pipeline.slopes import RESULT_TYPES, Slopes
 
 LAYOUT = fs.Layout.grid((4, 4), pixels=8)
