@@ -19,6 +19,7 @@ from faintspot.loop.simulation.methods import Method
 from faintspot.slopes.estimators import estimators
 from faintspot.slopes.estimators.built_in.total_variation import TotalVariation
 from faintspot.slopes.pipeline.settings import SharedOptions
+from faintspot.slopes.recorded.measuring import Choices
 from faintspot.slopes.simulate import Detector
 from faintspot.slopes.simulate.photometry import Photometry
 from faintspot.slopes.spots.laser_spots import LaserSpots
@@ -32,6 +33,7 @@ SAMPLES: list[Options] = [
     Detector(),
     fs.Calibration(),
     fs.Layout.grid((2, 2), pixels=8),
+    Choices(),
     NightPlan(),
     Photometry(area_m2=1.0, frame_time_s=1.0),
     LaserSpots(launch_m=(0.0, 0.0), spot_fwhm_arcsec=1.0),
@@ -63,7 +65,7 @@ def wrong_numbers(option: Option) -> Iterator[float]:
 def wrong_values(option: Option) -> Iterator[Any]:
     """Return values that a declaration does not allow."""
     if option.kind in (FLAG, TEXT):
-        yield from (3.0, None, ["a"], "" if option.kind == TEXT else "yes")
+        yield from (3.0, ["a"], "" if option.kind == TEXT else "yes", *(() if option.optional else (None,)))
     elif option.kind == TEXTS:
         yield from (3.0, [3.0], *([["neither"]] if option.choices else []))
     elif option.kind in (LIST, NUMBER_OR_LIST):

@@ -10,7 +10,7 @@ import click
 
 from faintspot.base.checks import not_none
 from faintspot.base.errors import InputError, MissingExtraError, present, require, require_linux
-from faintspot.base.options import REQUIRED, TEXT, Options
+from faintspot.base.options import FLAG, REQUIRED, TEXT, TEXTS, Options
 from faintspot.base.tables import parse_ranges
 
 _GENERAL = "Options"
@@ -152,13 +152,17 @@ def declared(
             if name not in (names or (name,)) or not what.meaning:
                 continue
             attributes: dict[str, object] = {"help": what.meaning, "type": int if what.whole else float}
-            if what.choices:
+            if what.kind == TEXTS:
+                attributes |= {"type": NAMES, "metavar": ",".join(what.choices)}
+            elif what.choices:
                 attributes["type"] = click.Choice(what.choices)
             elif what.kind == TEXT:
                 attributes["type"] = str
+            elif what.kind == FLAG:
+                attributes |= {"type": bool, "is_flag": True, "default": None}
             if what.unit:
                 attributes["metavar"] = what.unit.upper().replace("E-", "E")
-            if show_default or defaults[name] not in (None, REQUIRED):
+            if show_default or defaults[name] not in (None, REQUIRED, False, ()):
                 attributes["show_default"] = show_default or f"{defaults[name]}".removesuffix(".0")
             section = sections if isinstance(sections, str) else sections[what.group]
             command = option(flag_of(name), name, section=section, **attributes)(command)

@@ -9,12 +9,11 @@ import click
 from faintspot.base.errors import InputError, MissingExtraError, present
 from faintspot.base.flags import SubapertureFlag
 from faintspot.base.tables import parse_changes
-from faintspot.cli.commands import KEY, NAMES, REFERENCE, configuration_option, option
+from faintspot.cli.commands import KEY, REFERENCE, configuration_option, declared, option
 from faintspot.cli.output import progress_bar
-from faintspot.io.file_format import UNITS
 from faintspot.io.frames import slope_format
 from faintspot.io.stored_array import split_location
-from faintspot.slopes.recorded.measuring import Summary, measure_recorded
+from faintspot.slopes.recorded.measuring import Choices, Summary, measure_recorded
 
 
 @click.command()
@@ -32,33 +31,7 @@ from faintspot.slopes.recorded.measuring import Summary, measure_recorded
     "--set", "changes", metavar="NAME=VALUE", multiple=True, help="An option of the estimator; several times."
 )
 @option("--no-denoise", is_flag=True, help="Switch the denoising off: the other method of a comparison.")
-@option(
-    "--unit",
-    type=click.Choice(UNITS),
-    default="px",
-    help="Unit of positions in the output; arcsec needs layout --pixel-scale-arcsec.",
-    show_default="px",
-)
-@option(
-    "--mean-flux",
-    is_flag=True,
-    help="Take the flux of spots as their mean over the recording, not that of each frame: for steady, "
-    "faint stars.",
-)
-@option(
-    "--follow",
-    is_flag=True,
-    help="Follow spots out of their windows, up to 1.5 pitches of a smooth aberration.",
-)
-@option(
-    "--keep",
-    type=NAMES,
-    metavar="limited,unlike",
-    default=(),
-    help="Doubtful slopes that stay valid: limited (at search_range_px, or cut by their window), unlike (all "
-    "neighbours).",
-    show_default="none",
-)
+@declared(Choices, "unit", "mean_flux", "follow", "keep")
 @REFERENCE
 @KEY
 @option("--threads", type=click.IntRange(1), help="Most threads to use.", show_default="all processors")
@@ -112,6 +85,7 @@ def command(
         split_location(name)  # refuses what is not there
     changed = {} if estimator is None else {"estimator": estimator}
     changed |= parse_changes(changes) if changes else {}
+    options = {name: value for name, value in options.items() if value is not None}
     options |= {"changes": changed, "denoise": not no_denoise}
     with progress_bar("slopes") as advance:
         summary = measure_recorded(frames, config, output, progress=advance, **options)

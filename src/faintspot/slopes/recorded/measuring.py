@@ -8,15 +8,15 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypedDict, Unpack
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base import __version__
-from faintspot.base.checks import one_of
 from faintspot.base.errors import InputError, errors_within
-from faintspot.base.flags import SubapertureFlag, kept_flags, scaled_positions
+from faintspot.base.flags import KEEPABLE, SubapertureFlag, kept_flags, scaled_positions
+from faintspot.base.options import FLAG, TEXT, TEXTS, Options, number, setting
 from faintspot.io.file_format import UNITS, pixels_in
 from faintspot.io.frames import FrameSource, open_frames
 from faintspot.io.slopes import create_writer, read_reference
@@ -80,38 +80,54 @@ class Summary:
             self.flag_counts[flag] = self.flag_counts.get(flag, 0) + count
 
 
-class Reading(TypedDict, total=False):
-    """Choice of arrays in files of frames, see `faintspot.io.open_frames`."""
-
-    key: str | None
-    """Name of the array to read from files that hold several."""
-    time_axis: int | None
-    """Axis of cubes that counts the frames: 0, 1 or 2."""
-
-
-class Choices(Reading, total=False):
+@dataclass(frozen=True, eq=False)
+class Choices(Options):
     """Choices on which the slopes depend: with others, it is another run."""
 
-    denoise: bool
-    """False switches the denoising off for all sub-apertures."""
-    changes: Mapping[str, Any] | None
+    key: str | None = setting(None, "Array to read from files that hold several.", kind=TEXT)
+    time_axis: int | None = number(None, 0, 2, "Axis of cubes that counts the frames.", whole=True)
+    denoise: bool = setting(
+        True, "False switches the denoising off for all sub-apertures: the other method.", kind=FLAG
+    )
+    changes: Mapping[str, Any] | None = None
     """New values of settings by name, instead of those in the configuration; "estimator" is one."""
-    unit: str
-    """Unit of positions and standard errors in the output: "px" (default), or "arcsec", which needs the
-    layout's `pixel_scale_arcsec`."""
-    mean_flux: bool
-    """Whether to tell the estimator the mean flux of every sub-aperture over the recording, instead of
-    letting it take that of each frame: better where the star is faint and steady; see
-    `faintspot.MeanFlux`."""
-    follow: bool
-    """Whether to follow spots out of their windows, see `faintspot.SpotFollower`; not together with
-    `mean_flux`. When resumed, the frames before are measured again, to find the spots."""
-    keep: Sequence[str]
-    """Doubtful slopes that stay valid: those at their search limit or cut by their window ("limited"), and
-    those unlike all neighbours ("unlike")."""
-    reference: NDArray[Any] | str | Path | None
+    unit: str = setting(
+        "px",
+        "Unit of positions and errors in the output; arcsec needs layout --pixel-scale-arcsec.",
+        choices=tuple(UNITS),
+    )
+    mean_flux: bool = setting(
+        False,
+        "Take the flux of spots as their mean over the recording, not that of each frame: for steady, faint "
+        "stars.",
+        kind=FLAG,
+    )
+    follow: bool = setting(
+        False,
+        "Follow spots out of their windows, up to 1.5 pitches of a smooth aberration; resumed, the frames "
+        "before are measured again.",
+        kind=FLAG,
+    )
+    keep: Sequence[str] = setting(
+        (),
+        "Doubtful slopes that stay valid: limited (at search_range_px, or cut by their window), unlike (all "
+        "neighbours).",
+        kind=TEXTS,
+        choices=tuple(KEEPABLE),
+    )
+    reference: NDArray[Any] | str | Path | None = None
     """Reference positions, as for `SlopePipeline`, or the file that holds them, as "file" or "file:key", or
     slopes of which they are the mean; see `faintspot.io.slopes.read_reference`."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.follow and self.mean_flux:
+            raise InputError("follow (--follow) and mean_flux (--mean-flux): expected one of them, got both")
+
+    @property
+    def reference_file(self) -> str | Path | None:
+        """File of the reference positions."""
+        return self.reference if isinstance(self.reference, str | Path) else None
 
 
 def measure_recorded(
@@ -123,7 +139,7 @@ def measure_recorded(
     block_frames: int | None = None,
     overwrite: bool = False,
     progress: Progress | None = None,
-    **choices: Unpack[Choices],
+    **choices: Any,
 ) -> Summary:
     """Measure the slopes of all frames in some files and write them to a file.
 
@@ -148,35 +164,34 @@ def measure_recorded(
     progress : callable, optional
         Called with finished and all frames after every block.
     **choices
-        Values of `Choices`.
+        Fields of `Choices`.
 
     Raises
     ------
     InputError
         When a file cannot be read or written, or frames and configuration do not fit together.
     """
-    kept, follow = kept_flags(choices.get("keep", ())), choices.get("follow", False)
-    if follow and choices.get("mean_flux", False):
-        raise InputError("follow (--follow) and mean_flux (--mean-flux): expected one of them, got both")
-    key, reference = choices.get("key"), choices.get("reference")
-    described, origin, positions = configured(configuration_file, frames, key)
-    if reference is not None:
-        positions = read_reference(reference) if isinstance(reference, str | Path) else reference
+    chosen = Choices(**choices)
+    described, origin, positions = configured(configuration_file, frames, chosen.key)
+    if isinstance(chosen.reference, str | Path):
+        positions = read_reference(chosen.reference)
+    elif chosen.reference is not None:
+        positions = chosen.reference
     layout = described.layout
-    with open_frames(frames, key=key, time_axis=choices.get("time_axis")) as source:
+    with open_frames(frames, key=chosen.key, time_axis=chosen.time_axis) as source:
         _check_files(source, frames, output, layout, configuration_file)
         seen = survey(source.shape, stretches(source))
-        pipeline, notes = _pipeline(described, positions, seen, choices, threads)
-        if choices.get("mean_flux", False):
+        pipeline, notes = _pipeline(described, positions, seen, chosen, threads)
+        if chosen.mean_flux:
             pipeline = _with_mean_flux(pipeline, source)
-        attributes = _attributes(pipeline, source, frames, described, choices)
+        attributes = _attributes(pipeline, source, frames, described, chosen)
         if positions is not None:
             attributes["reference"] = np.asarray(positions).tolist()
         with errors_within(configuration_file):
-            measure = _measuring(pipeline, seen, follow=follow)
+            measure = _measuring(pipeline, seen, follow=chosen.follow)
         summary = Summary(source.n_frames, len(layout), doubtful=bool(layout.doubts))
         summary.notes = [note for note in (origin, *notes) if note]
-        factor = pixels_in(one_of("unit", attributes["unit"], UNITS), attributes)
+        factor = pixels_in(chosen.unit, attributes)
         with create_writer(
             output,
             n_frames=source.n_frames,
@@ -186,7 +201,7 @@ def measure_recorded(
             coordinates=layout_coordinates(layout),
             overwrite=overwrite,
         ) as writer:
-            _write(writer, measure, source, summary, kept, factor, block_frames, progress)
+            _write(writer, measure, source, summary, kept_flags(chosen.keep), factor, block_frames, progress)
     return summary
 
 
@@ -234,16 +249,14 @@ def _pipeline(
     threads: int | None,
 ) -> tuple[SlopePipeline, list[str]]:
     """Return the pipeline of the configuration and of what the frames show, and notes on the latter."""
-    layout, reference = described.layout, choices.get("reference")
-    settings = _settings(described.settings, choices)
+    layout, settings = described.layout, _settings(described.settings, choices)
     try:
         calibration, notes = _calibration(described.calibration, settings, layout, seen)
         spot: dict[str, Any] = described.spot
         pipeline = SlopePipeline(layout, settings, calibration, positions, **spot, threads=threads)
     except InputError as error:
         about_reference = positions is not None and error.name == "reference"
-        is_file = about_reference and isinstance(reference, str | Path)
-        raise error.within(reference if is_file else described.path) from None
+        raise error.within((about_reference and choices.reference_file) or described.path) from None
     return pipeline, notes
 
 
@@ -267,9 +280,9 @@ def _response(
 
 def _settings(settings: Settings, choices: Choices) -> Settings:
     """Return the settings as changed by the arguments."""
-    if changes := choices.get("changes"):
-        settings = settings.replace(**changes)
-    if not choices.get("denoise", True):
+    if choices.changes:
+        settings = settings.replace(**choices.changes)
+    if not choices.denoise:
         settings = without_denoising(settings, "denoise = False (--no-denoise)")
     return settings
 
@@ -343,9 +356,7 @@ def _attributes(
     choices: Choices,
 ) -> dict[str, Any]:
     """Return the attributes of the output; the fingerprint decides whether a run may be continued."""
-    key, unit, follow = choices.get("key"), choices.get("unit", "px"), choices.get("follow", False)
-    keep, time_axis = sorted(choices.get("keep", ())), choices.get("time_axis")
-    reference = choices.get("reference")
+    key, unit, keep, file = choices.key, choices.unit, sorted(choices.keep), choices.reference_file
     text = configuration.to_text(pipeline.layout, pipeline.settings, pipeline.calibration)
     paths = [str(Path(path).resolve()) for path in frames]
     state = hashlib.sha256()
@@ -355,7 +366,7 @@ def _attributes(
         str(key),
         *([] if unit == "px" else [unit]),
         *keep,
-        *(["follow"] if follow else []),
+        *(["follow"] if choices.follow else []),
         *paths,
         *(_version(split_location(path)[0]) for path in frames),
         str((source.n_frames, source.shape, source.dtype)),
@@ -373,11 +384,11 @@ def _attributes(
         "sources": paths,
         "source_key": key or "",
         "keep": keep,
-        **({"followed": True} if follow else {}),
+        **({"followed": True} if choices.follow else {}),
         "faintspot_version": __version__,
         "fingerprint": state.hexdigest(),
-        **({} if time_axis is None else {"source_time_axis": time_axis}),
-        **({"reference_file": str(reference)} if isinstance(reference, str | Path) else {}),
+        **({} if choices.time_axis is None else {"source_time_axis": choices.time_axis}),
+        **({} if file is None else {"reference_file": str(file)}),
     }
 
 
