@@ -5,7 +5,6 @@ those of benchmarks that are named also to docs/results/data, from where the doc
 """
 
 import importlib
-import importlib.util
 import sys
 import time
 import traceback
@@ -14,46 +13,59 @@ from pathlib import Path
 
 import click
 
-from benchmarks import compare, foreign_loops, machine, night_frames, paper_night, results, showing
+from benchmarks import compare, machine, results, showing
+from benchmarks.loops import foreign_loops, night_frames
 from benchmarks.measuring import Table
+from benchmarks.paper import paper_night
 
-_ORDER = (
-    "rivals",
-    "scale",
-    "projection",
-    "estimators",
-    "pictures",
-    "roofline",
-    "realtime",
-    "realtime_loop",
-    "realtime_guard",
-    "guard",
-    "validity",
-    "following",
-    "telemetry",
-    "recorded_tip_tilt",
-    "live_page",
-    "latency",
-    "realtime_sustained",
-    "pyrtc",
-    "pyrtc_loop",
-    "darc",
-    "loop",
-    "control",
-    "prediction",
-    "winds",
-    "large_sensors",
-    "layouts",
-    "wavefronts",
-    "metrology",
-    "beams",
-    "backgrounds",
-    "spot_widths",
-    "yardstick",
-    "startup",
-    "loaded",
-)
-NAMES = tuple(name for name in _ORDER if importlib.util.find_spec(f"benchmarks.{name}"))
+_FOLDERS = {
+    "frames": (
+        "rivals",
+        "scale",
+        "projection",
+        "estimators",
+        "pictures",
+        "roofline",
+        "validity",
+        "following",
+        "layouts",
+        "wavefronts",
+        "metrology",
+        "beams",
+        "backgrounds",
+        "spot_widths",
+    ),
+    "loops": (
+        "guard",
+        "telemetry",
+        "recorded_tip_tilt",
+        "loop",
+        "control",
+        "prediction",
+        "winds",
+        "large_sensors",
+    ),
+    "realtime": (
+        "realtime",
+        "realtime_loop",
+        "realtime_guard",
+        "live_page",
+        "latency",
+        "realtime_sustained",
+        "pyrtc",
+        "pyrtc_loop",
+        "darc",
+        "startup",
+    ),
+    "": ("yardstick", "loaded"),
+}
+"""Benchmarks by folder; "": beside this file."""
+MODULES = {
+    name: ".".join(filter(None, ("benchmarks", folder, name)))
+    for folder, names in _FOLDERS.items()
+    for name in names
+}
+NAMES = tuple(MODULES)
 LONG = {
     "darc",
     "guard",
@@ -127,7 +139,7 @@ def measured(name: str) -> results.Benchmark:
     failure = ""
     tables: list[Table] = []
     try:
-        module = importlib.import_module(f"benchmarks.{name}")
+        module = importlib.import_module(MODULES[name])
         tables = module.run()
     except Exception as error:
         traceback.print_exc()

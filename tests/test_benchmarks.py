@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from benchmarks import layouts, rivals, simulated_arrays
+from benchmarks.frames import layouts, rivals, simulated_arrays
 
 
 @pytest.fixture(scope="module")

@@ -8,8 +8,10 @@ from types import ModuleType
 
 import pytest
 from benchmarks import __main__ as command
-from benchmarks import machine, night_frames, paper_night, results
+from benchmarks import machine, results
+from benchmarks.loops import night_frames
 from benchmarks.measuring import Table
+from benchmarks.paper import paper_night
 from click.testing import CliRunner
 from tests import benchmark_cases as cases
 from tests.experiments.night_cases import night_with
@@ -39,9 +41,9 @@ def made_up(monkeypatch: pytest.MonkeyPatch) -> None:
 
     runs = {"rivals": lambda: [cases.rivals_table()], "scale": fail, "estimators": interrupt}
     for name, run in runs.items():
-        module = ModuleType(f"benchmarks.{name}", "What it is.\n\nHow it is measured.")
+        module = ModuleType(command.MODULES[name], "What it is.\n\nHow it is measured.")
         module.run = run  # type: ignore[attr-defined]
-        monkeypatch.setitem(sys.modules, f"benchmarks.{name}", module)
+        monkeypatch.setitem(sys.modules, module.__name__, module)
 
 
 def options(folder: Path) -> list[str]:

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from benchmarks.foreign import evaluation, rows
-from benchmarks.foreign.evaluation import INTEGRATOR
-from benchmarks.foreign.oopao import OopaoCase
-from benchmarks.foreign_loops import publish, run_command, table_of
+from benchmarks.loops.foreign import evaluation, rows
+from benchmarks.loops.foreign.evaluation import INTEGRATOR
+from benchmarks.loops.foreign.oopao import OopaoCase
+from benchmarks.loops.foreign_loops import publish, run_command, table_of
 from click.testing import CliRunner
 
 from faintspot.loop.telemetry.choices import FILTER

@@ -127,7 +127,7 @@ def _fully_lit(flat: Floats) -> NDArray[np.bool_]:
 
 def hcipy(number: int, seed: int) -> UnitSpots:
     """Return spots of HCIPy: propagation through all lenslets at once, so that neighbours interfere."""
-    from benchmarks.foreign.specula import example
+    from benchmarks.loops.foreign.specula import example
 
     system = example("hcipy_loop")
 

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from benchmarks.darc import DARK_ADU, Sensor, aligned, configuration_example, modules
-from benchmarks.darc_process import Darc, Parameters, build, missing, parameters
+from benchmarks.realtime.darc import DARK_ADU, Sensor, aligned, configuration_example, modules
+from benchmarks.realtime.darc_process import Darc, Parameters, build, missing, parameters
 from tests.adapters.library_cases import CACHE
 
 import faintspot as fs

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from benchmarks.following import Case, Recording, recording
+from benchmarks.frames.following import Case, Recording, recording
 from numpy.typing import NDArray
 from tests.patience import mostly_slow
 from tests.refusals import refused

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from benchmarks.following import Case, Recording, recording
+from benchmarks.frames.following import Case, Recording, recording
 from tests.cli.cli_cases import Commands
 from tests.slopes.recorded.recorded_cases import Page
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from benchmarks.backgrounds import ACROSS, KINDS, PIXELS, scene
+from benchmarks.frames.backgrounds import ACROSS, KINDS, PIXELS, scene
 from numpy.typing import NDArray
 from tests.patience import mostly_slow
 

@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
-from benchmarks.layouts import verdict
-from benchmarks.simulated_arrays import aberrated_array, plain_small, random_array
+from benchmarks.frames.layouts import verdict
+from benchmarks.frames.simulated_arrays import aberrated_array, plain_small, random_array
 from numpy.typing import NDArray
 from tests.patience import mostly_slow
 from tests.slopes.sensor.sensor_cases import spot_frame

@@ -1,0 +1,1 @@
+"""The engine, and other real-time software."""
