@@ -8,10 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from faintspot.base.arrays import Floats
 from faintspot.base.checks import finite_array, number_between
 from faintspot.base.errors import InputError
-
-Floats = NDArray[np.float64]
 
 OUTLIER_PX = 1.0
 """An error beyond this on either axis is an outlier: half the width of a Nyquist-sampled spot. It does not

@@ -6,14 +6,13 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from faintspot.base.arrays import Floats
 from faintspot.loop.control import integrator
 from faintspot.loop.control.base import CommandDelayLine, Controller, without_prior
 from faintspot.loop.control.configuration import Control
 from faintspot.loop.control.options import CONTROLLER
 from faintspot.slopes.kernels.compiling import Direct
 from faintspot.slopes.sensor.layout import Layout
-
-Floats = NDArray[np.float64]
 
 _BEYOND_OPEN = 1.25  # times the open loop's slopes; a loop that leaves more makes things worse
 _LARGEST_RESIDUAL = 0.25  # of a window's side, used if the open loop's slopes are not known

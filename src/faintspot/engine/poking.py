@@ -5,13 +5,12 @@ import time
 import numpy as np
 from numpy.typing import NDArray
 
+from faintspot.base.arrays import Floats
 from faintspot.base.checks import number_between
 from faintspot.base.errors import InputError
 from faintspot.base.files import Closing
 from faintspot.engine.streams.shared_streams import create_stream
 from faintspot.engine.telemetry.ring import TelemetryRing
-
-Floats = NDArray[np.float64]
 
 _POLL_S = 5e-4
 _NO_FRAMES_S = 5.0

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from faintspot.base.arrays import Floats
 from faintspot.base.errors import InputError
 from faintspot.slopes.camera.calibration import Calibration
 from faintspot.slopes.kernels import streaming
@@ -20,8 +21,6 @@ from faintspot.slopes.pipeline.slope_pipeline import SlopePipeline
 from faintspot.slopes.sensor.layout import Layout
 from faintspot.slopes.spots.fixed_weights import FixedWeights
 from faintspot.slopes.spots.psf import PSF
-
-Floats = NDArray[np.float64]
 
 SMALLEST_STD_PX, LARGEST_STD_PX = 1e-6, 1e4
 """Smallest and largest standard deviation of a prior [px]."""

@@ -13,14 +13,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from faintspot.base.arrays import Floats
 from faintspot.base.checks import number_between, numbers_between
 from faintspot.base.errors import InputError
 from faintspot.base.statistics import UNKNOWN, Estimate, magnitudes
 from faintspot.experiments.methods import crossings
-
-Floats = NDArray[np.float64]
 
 CONFIDENCE = 0.95
 _RESAMPLES = 400

@@ -8,8 +8,9 @@ from enum import IntEnum
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from faintspot.base.arrays import Floats
 from faintspot.base.options import AUTO
 from faintspot.base.statistics import slope_statistics
 from faintspot.loop.simulation.methods import Method
@@ -20,8 +21,6 @@ from faintspot.slopes.estimators.registry import estimators
 from faintspot.slopes.estimators.sensor import Scene
 from faintspot.slopes.pipeline.settings import Settings
 from faintspot.slopes.spots.psf import PSF
-
-Floats = NDArray[np.float64]
 
 _ROUNDS = 2  # of looking along each axis in turn
 

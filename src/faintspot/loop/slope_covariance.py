@@ -21,10 +21,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
+from faintspot.base.arrays import Floats
 from faintspot.base.errors import InputError
 from faintspot.slopes.spots.shapes import R0_WAVELENGTH_M, structure_function
-
-Floats = NDArray[np.float64]
 
 ARCSEC = math.pi / 180 / 3600
 OUTER_SCALE_M = 25.0

@@ -13,10 +13,9 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
+from faintspot.base.arrays import Floats
 from faintspot.loop.slope_covariance import OUTER_SCALE_M, SlopeTurbulence
 from faintspot.slopes.spots.shapes import R0_WAVELENGTH_M
-
-Floats = NDArray[np.float64]
 
 OUTER_SCALE_SPREAD = 0.7
 """Standard deviation of the logarithm of the outer scale before telemetry."""

@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from faintspot.base.arrays import Floats
 from faintspot.base.errors import InputError
 from faintspot.base.files import Closing, derived, output_errors, write_atomically
 from faintspot.engine.child_processes import ONE_THREAD, ChildProcesses
@@ -33,7 +33,6 @@ from faintspot.slopes.pipeline.configuration import Configuration, save
 from faintspot.slopes.pipeline.settings import Settings
 
 Say = Callable[[str], None]
-Floats = NDArray[np.float64]
 
 _STAR = "camera_3e"
 # Chosen in the simulated loop with other realisations of the turbulence than the one shown.

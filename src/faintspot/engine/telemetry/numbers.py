@@ -6,10 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from faintspot.base.arrays import Floats
 from faintspot.base.statistics import UNKNOWN, Estimate, mean_by_blocks
 from faintspot.io.telemetry import Telemetry, all_left_out
-
-Floats = NDArray[np.float64]
 
 _LONGEST = 80  # text of a changed value
 _TURNS_TOGETHER = 10  # neighbouring turns of the bootstrap's blocks: the turbulence changes slowly

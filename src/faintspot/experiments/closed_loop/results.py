@@ -10,6 +10,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from faintspot.base.arrays import Floats
 from faintspot.base.checks import finite_array
 from faintspot.base.errors import InputError
 from faintspot.base.files import NpzFile
@@ -26,8 +27,6 @@ from faintspot.slopes.estimators.built_in.window import Window
 from faintspot.slopes.estimators.registry import estimators
 from faintspot.slopes.pipeline.settings import Settings
 from faintspot.slopes.spots.psf import PSF, spot_psf
-
-Floats = NDArray[np.float64]
 
 
 def magnitude_limit(magnitudes: ArrayLike, strehl: ArrayLike, level: float) -> Estimate:

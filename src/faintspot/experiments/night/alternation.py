@@ -13,9 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 
+from faintspot.base.arrays import Floats
 from faintspot.base.statistics import FEWEST_PIECES, Estimate, student
-
-Floats = NDArray[np.float64]
 
 _SHARES = (0.0, 0.1, 0.25, 0.5, 0.75, 0.9, 0.97, 0.995)  # of the variance that drifts
 _TIMES = 8  # trial correlation times

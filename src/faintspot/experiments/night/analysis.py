@@ -6,12 +6,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from faintspot.base.arrays import Floats
 from faintspot.base.report.texts import Texts
 from faintspot.base.statistics import UNKNOWN, Estimate
 from faintspot.experiments.night.alternation import coefficient, jackknife, predicted_by_others
 from faintspot.experiments.night.protocol import BEST_STRENGTHS, Night
 
-Floats = NDArray[np.float64]
 Rows = NDArray[np.bool_]
 
 SIGMA = 3.0

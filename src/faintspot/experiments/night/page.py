@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from faintspot.base.arrays import Floats
 from faintspot.base.files import write_atomically
 from faintspot.base.report import page
 from faintspot.base.report.plots import FLUX_GREY, METHOD_COLOURS, WIDTH, Line, Panel
@@ -36,7 +37,6 @@ from faintspot.experiments.night.paper import (
 from faintspot.experiments.night.protocol import COUNTS, Night
 from faintspot.loop.simulation.configuration import LoopConfiguration
 
-Floats = NDArray[np.float64]
 Shown = dict[str, tuple[NDArray[np.bool_], dict[str, object]]]
 """Blocks and style of what is drawn, by name."""
 

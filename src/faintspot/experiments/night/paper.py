@@ -7,11 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from faintspot.base.arrays import Floats
 from faintspot.base.statistics import Estimate
 from faintspot.experiments.night.analysis import differences
 from faintspot.experiments.night.protocol import BEST_STRENGTHS, TV, Night, NightPlan
-
-Floats = NDArray[np.float64]
 
 PAPER_MEANS = np.array(
     [[0.184, 0.188, 0.200], [0.203, 0.205, 0.214], [0.209, 0.214, 0.220], [0.196, 0.200, 0.206]]

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from faintspot.base.arrays import Floats
 from faintspot.base.checks import number_between
 from faintspot.base.errors import InputError, load_package
 from faintspot.base.files import output_errors
@@ -184,8 +185,6 @@ QUICK_PLAN = NightPlan(
     block_frames=150, settle_in_block=60, gap_frames=4500, strengths=(4, 6, 4, 6), repeats=(2, 2, 2, 2)
 )
 
-
-Floats = NDArray[np.float64]
 
 NIGHT_STORE = "night.zarr"
 """Name of the store in a folder of results."""

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from faintspot.base.arrays import Floats
 from faintspot.base.checks import number_between
 from faintspot.base.errors import InputError
 from faintspot.base.report.page import Report, Section
@@ -43,8 +43,6 @@ from faintspot.loop.telemetry.choices import unseen_m2
 from faintspot.loop.telemetry.recorded_loop import control_of, system_numbers
 from faintspot.loop.telemetry.recording import CLOSED
 from faintspot.slopes.sensor.pupil import side_m
-
-Floats = NDArray[np.float64]
 
 SCIENCE_WAVELENGTH_M = 1.65e-6
 _MOST_BLOCKS = 400  # of a night: the analysis compares each with all others

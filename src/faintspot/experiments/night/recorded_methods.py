@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from faintspot.base.arrays import Floats
 from faintspot.base.errors import InputError
 from faintspot.base.text_files import parse_text
 from faintspot.io.frames import read_array
@@ -140,8 +141,6 @@ def _in_words(measured: str) -> str:
         return "settings of the engine, without denoising"
     return measured.replace("+", ", ")
 
-
-Floats = NDArray[np.float64]
 
 _COLUMNS = (2, 3)
 

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from faintspot.base.arrays import Floats
 from faintspot.experiments.night.protocol import NIGHT_STORE, QUICK_PLAN, Night, NightPlan, counts_per_e
 from faintspot.experiments.running import Advance, Unit, WorkerPool, run_units
 from faintspot.experiments.store import UnitStore, ZarrStore, fingerprint_of
@@ -18,8 +19,6 @@ from faintspot.loop.simulation.sections import CLOSED
 from faintspot.loop.simulation.simulation import simulate_loop
 from faintspot.loop.slope_covariance import SlopeTurbulence
 from faintspot.loop.turbulence_strength import turbulence_strength
-
-Floats = NDArray[np.float64]
 
 FEWEST_FRAMES = 20
 

@@ -6,8 +6,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from faintspot.base.arrays import Floats
 from faintspot.base.errors import InputError
 from faintspot.base.statistics import Estimate, SlopeStatistics
 from faintspot.base.tables import save_tables
@@ -21,8 +22,6 @@ from faintspot.slopes.camera.calibration import Calibration
 from faintspot.slopes.pipeline import configuration
 from faintspot.slopes.pipeline.settings import Settings
 from faintspot.slopes.spots.psf import PSF
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from faintspot.base.arrays import Floats
 from faintspot.base.checks import not_none, spawn
 from faintspot.base.statistics import UNKNOWN, Estimate
 from faintspot.experiments.planner.question import Question
@@ -18,8 +19,6 @@ from faintspot.slopes.sensor.layout import Layout
 from faintspot.slopes.spots.psf import PSF
 from faintspot.slopes.training.psf_learning import LearntPSF, fit_spots
 from faintspot.slopes.training.spot_transfer import variance_over_expected
-
-Floats = NDArray[np.float64]
 
 _SPOTS, _FEWEST_SPOTS = 4096, 1024  # of 16 x 16 px; fewer of larger windows
 _COUNTABLE_E = 0.25  # read noise below which images hold whole electrons, which are dealt out one by one

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from faintspot.base.arrays import Floats
 from faintspot.base.checks import not_none, spawn
 from faintspot.base.errors import InputError
 from faintspot.base.options import TEXT, setting
@@ -287,8 +288,6 @@ class Question(StarLight, StatedOptics, StatedCamera):
                 + ("flux_e" if self.magnitude is None else "magnitude, subaperture_m and frame_rate_hz")
             )
 
-
-Floats = NDArray[np.float64]
 
 SPOTS_PER_FRAME = 64
 

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from faintspot.base.arrays import Floats
 from faintspot.base.checks import spawn
 from faintspot.base.errors import InputError
 from faintspot.base.options import Options, number, setting
@@ -17,8 +17,6 @@ from faintspot.slopes.sensor.window_checks import LARGEST_WINDOW, SMALLEST_WINDO
 from faintspot.slopes.spots.psf import PSF
 from faintspot.slopes.spots.shapes import FWHM_OF_SIZE_1_PX, spots
 from faintspot.slopes.spots.speckled import LARGEST_D_OVER_R0, speckled_spots
-
-Floats = NDArray[np.float64]
 
 PROFILES = tuple(FWHM_OF_SIZE_1_PX)
 SPECKLED_ABOVE = 0.7

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from faintspot.base.arrays import Floats
 from faintspot.base.checks import number_between, spawn
 from faintspot.base.errors import InputError
 from faintspot.base.statistics import OUTLIER_PX, Estimate, SlopeStatistics, absolute_errors, slope_statistics
@@ -31,7 +31,6 @@ from faintspot.slopes.pipeline.slopes import Slopes
 from faintspot.slopes.spots.bounds import MEAN_ABSOLUTE, cramer_rao
 from faintspot.slopes.spots.psf import PSF
 
-Floats = NDArray[np.float64]
 Progress = Callable[[int, int], None]
 
 _REALISATIONS, _FEWEST_REALISATIONS = 4096, 1024  # of 16 x 16 px; fewer of larger windows

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from faintspot.base.arrays import Floats
 from faintspot.base.checks import not_none
 from faintspot.base.statistics import OUTLIER_PX, slope_statistics
 from faintspot.experiments.methods import keeps_every_k, knows_the_spot
@@ -17,7 +18,6 @@ from faintspot.experiments.study.cell_methods import (
     Block,
     Candidate,
     CellMethods,
-    Floats,
     Measured,
     errors_of,
     moments_of,

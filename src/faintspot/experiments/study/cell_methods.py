@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from faintspot.base.arrays import Floats
 from faintspot.base.checks import not_none
 from faintspot.experiments.methods import Kind, keeps_every_k
 from faintspot.loop.simulation.methods import Method
@@ -31,7 +32,6 @@ if TYPE_CHECKING:
 
 
 Images = NDArray[np.float32]
-Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 Block = tuple[Images, Floats]
 """Images (n, side, side) and the true positions of their spots, (n, 2) px."""

@@ -8,15 +8,13 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar, NamedTuple, Protocol
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from faintspot.base.arrays import Floats
 from faintspot.loop.control.reconstructor import LARGEST_CORRELATION, Reconstructor
 
 if TYPE_CHECKING:
     from faintspot.slopes.kernels.products import ProductPart
-
-
-Floats = NDArray[np.float64]
 
 
 class CommandDelayLine:

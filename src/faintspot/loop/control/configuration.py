@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from faintspot.base.arrays import Floats
 from faintspot.base.checks import finite_array
 from faintspot.base.errors import InputError, errors_within
 from faintspot.base.tables import Tables, save_tables
@@ -37,8 +38,6 @@ if TYPE_CHECKING:
     from faintspot.loop.control.identification.model import Kalman
     from faintspot.loop.control.integrator import LoopPlant
 
-
-Floats = NDArray[np.float64]
 
 INTERACTION, REFERENCE = "interaction_matrix", "reference_slopes"
 MODEL = "model"

@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from faintspot.base.arrays import Floats
 from faintspot.slopes.kernels.compiling import Direct, compiled_with
 
-Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 STUCK_FRAMES = 50

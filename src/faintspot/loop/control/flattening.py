@@ -7,13 +7,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import lsq_linear
 
+from faintspot.base.arrays import Floats
 from faintspot.base.checks import finite_array, number_between
 from faintspot.base.errors import InputError
 from faintspot.base.files import check_ending, csv_text, write_atomically
 from faintspot.loop.control.reconstructor import Reconstructor, make_reconstructor
 from faintspot.slopes.pipeline.slopes import Slopes
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

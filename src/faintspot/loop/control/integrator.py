@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from faintspot.base.arrays import Floats
 from faintspot.loop.control.base import (
     SETTLE_FRAMES,
     CommandDelayLine,
@@ -27,8 +28,6 @@ from faintspot.slopes.kernels.products import (
     finish_product,
     is_measured,
 )
-
-Floats = NDArray[np.float64]
 
 
 class Integrator(Controller):

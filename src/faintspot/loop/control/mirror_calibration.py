@@ -10,14 +10,13 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from faintspot.base.arrays import Floats
 from faintspot.base.checks import number_between
 from faintspot.base.errors import InputError
 from faintspot.base.files import derived, save_arrays, write_atomically
 from faintspot.base.flags import UNMEASURED, SubapertureFlag
 from faintspot.loop.control.configuration import INTERACTION, REFERENCE, save_control
 from faintspot.slopes.sensor.layout import Layout
-
-Floats = NDArray[np.float64]
 
 FEWEST_ROUNDS = 4
 """Number of rounds needed to estimate errors from the scatter."""

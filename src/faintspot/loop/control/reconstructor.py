@@ -5,10 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from faintspot.base.arrays import Floats
 from faintspot.base.checks import finite_array, number_between
 from faintspot.base.errors import InputError
-
-Floats = NDArray[np.float64]
 
 LARGEST_CORRELATION = 0.99  # of x and y: a narrower ellipse is not known from one frame
 

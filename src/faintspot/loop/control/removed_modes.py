@@ -5,13 +5,12 @@ from functools import partial
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from faintspot.base.arrays import Floats
 from faintspot.base.checks import finite_array, one_of
 from faintspot.base.errors import InputError
 from faintspot.base.flags import UNMEASURED
 from faintspot.loop.control.integrator import MEAN_SQUARE
 from faintspot.slopes.kernels.compiling import Direct, compiled_with
-
-Floats = NDArray[np.float64]
 
 NO_MODES, TIP_TILT, TIP_TILT_FOCUS = "none", "tip_tilt", "tip_tilt_focus"
 REMOVED_MODES = NO_MODES, TIP_TILT, TIP_TILT_FOCUS

@@ -8,7 +8,6 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from faintspot.base.errors import InputError
 from faintspot.loop.control.base import INTEGRATOR, OpenLoopTelemetry, without_prior
@@ -25,7 +24,6 @@ from faintspot.loop.simulation.telescope import prepare
 from faintspot.loop.slope_covariance import ARCSEC
 from faintspot.slopes.pipeline.configuration import to_text
 
-Floats = NDArray[np.float64]
 Simulate = Callable[..., LoopRecord]
 
 FIRST_TELEMETRY_REALISATION = 2000

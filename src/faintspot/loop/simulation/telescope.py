@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from faintspot.base.arrays import Floats
 from faintspot.loop.control.reconstructor import Reconstructor, check_controllable, make_reconstructor
 from faintspot.loop.simulation.atmosphere import MovingLayers, make_atmosphere
 from faintspot.loop.simulation.configuration import LoopConfiguration
@@ -35,8 +36,6 @@ from faintspot.slopes.pipeline.light import MeanFlux
 from faintspot.slopes.pipeline.settings import Settings
 from faintspot.slopes.pipeline.slope_pipeline import SlopePipeline
 from faintspot.slopes.spots.psf import PSF, spot_psf
-
-Floats = NDArray[np.float64]
 
 
 def make_detector(configuration: LoopConfiguration) -> Detector:

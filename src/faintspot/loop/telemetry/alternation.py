@@ -14,13 +14,12 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from faintspot.base.arrays import Floats
 from faintspot.loop.control.flattening import residual_phase
 from faintspot.loop.control.identification.slope_noise import SlopeNoise, noise_of_slopes
 from faintspot.loop.control.reconstructor import make_reconstructor
 from faintspot.loop.slope_covariance import ARCSEC, SlopeTurbulence
 from faintspot.loop.telemetry.recorded_loop import frame_rate
-
-Floats = NDArray[np.float64]
 
 FEWEST_SCORED = 5
 """Frames of a turn after settling, of which a residual phase is computed."""

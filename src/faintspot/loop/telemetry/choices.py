@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from faintspot.base.arrays import Floats
 from faintspot.base.checks import not_none
 from faintspot.base.errors import InputError
 from faintspot.base.statistics import mean_by_blocks
@@ -30,8 +31,6 @@ from faintspot.loop.control.integrator import LoopPlant
 from faintspot.loop.control.kalman.predictor import steady_covariance
 from faintspot.loop.control.reconstructor import make_reconstructor
 from faintspot.loop.slope_covariance import ARCSEC, SlopeTurbulence
-
-Floats = NDArray[np.float64]
 
 BEST, AS_RUN = "integrator, best gain", "as it ran"
 FILTER = "predictive Kalman filter"

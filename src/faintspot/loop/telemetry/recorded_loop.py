@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from faintspot.base.arrays import Floats
 from faintspot.base.checks import finite_array, increasing, one_of, real_array
 from faintspot.base.errors import InputError, errors_within
 from faintspot.base.files import read_arrays
@@ -34,8 +35,6 @@ from faintspot.loop.slope_covariance import ARCSEC
 from faintspot.loop.telemetry.recording import CLOSED
 from faintspot.slopes.recorded.stored_run import open_run
 from faintspot.slopes.sensor.pupil import side_m
-
-Floats = NDArray[np.float64]
 
 UNITS = {"px": None, "arcsec": 1.0, "rad": 1 / ARCSEC}
 """Units of slopes, in arcsec."""

@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from faintspot.base.arrays import Floats
 from faintspot.base.errors import InputError
 from faintspot.loop.control.base import INTEGRATOR, KALMAN, split_control, without_prior
 from faintspot.loop.control.configuration import Control
@@ -20,7 +20,6 @@ from faintspot.slopes.sensor.pupil import side_m
 if TYPE_CHECKING:
     from faintspot.io.telemetry import Telemetry
 
-Floats = NDArray[np.float64]
 
 CLOSED = 2
 """State of a closed loop in telemetry."""

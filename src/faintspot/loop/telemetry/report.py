@@ -9,8 +9,8 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from faintspot.base.arrays import Floats
 from faintspot.base.errors import InputError
 from faintspot.base.report.texts import Texts
 from faintspot.loop.control.identification.layers import Identification, Identified
@@ -40,7 +40,6 @@ if TYPE_CHECKING:
     from faintspot.loop.control.identification.learnt_loop import ObservedLoop
     from faintspot.loop.telemetry.choices import ControlChoice
 
-Floats = NDArray[np.float64]
 
 _TEXT = Texts("faintspot.loop.telemetry")
 _PARTS = ("frames", "loop", "noise", "turbulence", "vibrations", "spectra", "choices")

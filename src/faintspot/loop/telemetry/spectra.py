@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from faintspot.base.arrays import Floats
 from faintspot.loop.control.base import OpenLoopTelemetry
 from faintspot.loop.control.identification.layers import Identified
 from faintspot.loop.control.identification.loop_delay import LoopDelay
@@ -24,8 +25,6 @@ from faintspot.loop.slope_covariance import ARCSEC, SlopeTurbulence
 from faintspot.loop.turbulence_strength import differential_image_motion, turbulence_strength
 from faintspot.slopes.spots.shapes import R0_WAVELENGTH_M
 from faintspot.slopes.wavefront.discrepancy import not_gradients
-
-Floats = NDArray[np.float64]
 
 _LONGEST = 512
 _FASTEST_M_PER_S = 60.0

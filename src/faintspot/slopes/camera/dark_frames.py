@@ -8,13 +8,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from faintspot.base.arrays import Floats
 from faintspot.base.statistics import MAD_TO_STD
 from faintspot.base.tables import is_map
 from faintspot.slopes.camera.calibration import Calibration
 from faintspot.slopes.camera.frame_checks import find_hot_pixels
 from faintspot.slopes.sensor.layout import Layout
-
-Floats = NDArray[np.float64]
 
 FEWEST_FRAMES = 10
 """Number of dark frames from which on blinking pixels are looked for."""

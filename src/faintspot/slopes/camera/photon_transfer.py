@@ -6,9 +6,10 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.special import chdtri
 
+from faintspot.base.arrays import Floats
 from faintspot.base.checks import finite_array, number_between
 from faintspot.base.errors import InputError
 from faintspot.base.statistics import MAD_TO_STD, UNKNOWN, Estimate
@@ -16,8 +17,6 @@ from faintspot.slopes.camera.dark_frames import DarkPixels, dark_pixels
 from faintspot.slopes.camera.frame_checks import are_repeated
 from faintspot.slopes.camera.transfer_curve import LineFit, TransferCurve, fit_line, photon_transfer
 from faintspot.slopes.sensor.layout import Layout
-
-Floats = NDArray[np.float64]
 
 _LARGEST_SCATTER = 3.0  # mean square of bright pixels' variances about the line, over the expected one
 _LARGEST_SECOND_ORDER = 0.15  # largest relative change of the slope by second derivatives

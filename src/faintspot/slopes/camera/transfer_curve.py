@@ -10,11 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import spline_filter1d
 
+from faintspot.base.arrays import Floats
 from faintspot.base.checks import numbers_between
 from faintspot.base.errors import InputError
 from faintspot.slopes.sensor.layout import Layout
-
-Floats = NDArray[np.float64]
 
 _TILE = 16  # side of the parts of a frame that are assumed to move together, px
 _GROUPS = 16  # of pixels, for standard errors

@@ -15,12 +15,11 @@ from typing import Any, ClassVar, NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from faintspot.base.arrays import Floats
 from faintspot.base.errors import InputError
 from faintspot.base.options import Options, is_auto
 from faintspot.slopes.estimators.sensor import Scene, Sensor
 from faintspot.slopes.kernels.groups import COMMON_ROWS, flux_of_groups
-
-Floats = NDArray[np.float64]
 
 
 class Need(enum.Enum):

@@ -6,14 +6,12 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from faintspot.base.arrays import Floats
 from faintspot.slopes.camera.calibration import Calibration
 from faintspot.slopes.sensor.layout import Layout
 from faintspot.slopes.spots.fixed_weights import FixedWeights
 from faintspot.slopes.spots.psf import PSF
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,12 +6,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from faintspot.base.arrays import Floats
 from faintspot.slopes.kernels.brightest import SMALLEST_VARIANCE
 from faintspot.slopes.kernels.spot_rows import MARGIN, PHASES
 from faintspot.slopes.spots.psf import PSF
 from faintspot.slopes.spots.shapes import FWHM_TO_STD
-
-Floats = NDArray[np.float64]
 
 START_SMOOTHING = (
     0.73  # standard deviation of the smoothing in units of the spot's FWHM: about a matched filter

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from faintspot.base.arrays import Floats
 from faintspot.base.options import is_auto
 from faintspot.slopes.camera.calibration import Calibration
 from faintspot.slopes.estimators.base import Estimator, EstimatorPlan
@@ -33,8 +34,6 @@ from faintspot.slopes.spots.psf import PSF
 
 _FWHM_OF_KEPT = 0.58  # px, times the square root of a good number of kept pixels: 12 for a FWHM of 2 px
 _MOST_FLUX_E = 9e8  # mean flux per sub-aperture above which settings stay constant
-
-Floats = NDArray[np.float64]
 
 
 def packed_calibration(layout: Layout, maps: NDArray[np.float32], width: int) -> NDArray[np.float32]:

@@ -5,11 +5,12 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from faintspot.base.arrays import Floats
 from faintspot.base.errors import InputError
 from faintspot.base.flags import INVALID, UNMEASURED, SubapertureFlag, are_valid
 from faintspot.io.slopes import subtracted_reference
 from faintspot.slopes.pipeline.slopes import Slopes
-from faintspot.slopes.recorded.statistics import Floats, mean_over_valid
+from faintspot.slopes.recorded.statistics import mean_over_valid
 from faintspot.slopes.recorded.stored_run import StoredRun
 from faintspot.slopes.sensor.layout import Layout
 from faintspot.slopes.sensor.pupil import lenslet_pitch

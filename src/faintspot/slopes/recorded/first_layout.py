@@ -10,6 +10,7 @@ import numpy as np
 import scipy.ndimage
 from numpy.typing import NDArray
 
+from faintspot.base.arrays import Floats
 from faintspot.base.errors import InputError, errors_within
 from faintspot.base.statistics import MAD_TO_STD
 from faintspot.base.tables import Tables
@@ -43,8 +44,6 @@ from faintspot.slopes.sensor.layout import OPTICS, Layout
 from faintspot.slopes.sensor.region import neighbour_vectors
 from faintspot.slopes.sensor.window_checks import LARGEST_WINDOW, window_size
 from faintspot.slopes.spots.shapes import FWHM_TO_STD
-
-Floats = NDArray[np.float64]
 
 _MOST_FRAMES = 200  # averaged to find the spots
 _FIRST_FRAMES = 20  # measured for the settings

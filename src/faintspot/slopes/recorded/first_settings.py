@@ -9,6 +9,7 @@ import scipy.ndimage
 import scipy.special
 from numpy.typing import ArrayLike, NDArray
 
+from faintspot.base.arrays import Floats
 from faintspot.base.errors import InputError
 from faintspot.slopes.camera.calibration import Calibration, binned, binned_calibration
 from faintspot.slopes.estimators.base import Need
@@ -22,8 +23,6 @@ from faintspot.slopes.sensor.region import neighbour_vectors, neighbours_of
 from faintspot.slopes.sensor.window_checks import LARGEST_WINDOW
 from faintspot.slopes.spots.psf import PSF
 from faintspot.slopes.spots.shapes import FWHM_TO_STD
-
-Floats = NDArray[np.float64]
 
 _FEWEST_PX = 4  # of a window's side; below, as in quad cells, every pixel counts
 _WIDTH_OF_WINDOW = 0.25  # of the window's side, where no spot is seen

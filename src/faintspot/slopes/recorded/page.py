@@ -7,13 +7,14 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from faintspot.base.arrays import Floats
 from faintspot.base.errors import InputError
 from faintspot.base.flags import SubapertureFlag, leave_out
 from faintspot.base.report.page import POSITIONS, Part, Report, Section, Table, configuration_section
 from faintspot.base.report.texts import Texts, percentage
 from faintspot.base.statistics import UNKNOWN, Estimate
 from faintspot.slopes.recorded import pictures, statistics
-from faintspot.slopes.recorded.statistics import Floats, MeasuredSlopes, median
+from faintspot.slopes.recorded.statistics import MeasuredSlopes, median
 from faintspot.slopes.sensor.layout import Layout
 from faintspot.slopes.wavefront import certify, fit_wavefront
 from faintspot.slopes.wavefront.figure import wavefront_figure

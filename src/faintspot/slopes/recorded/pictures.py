@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import binary_closing
 
+from faintspot.base.arrays import Floats
 from faintspot.base.report import plots
 from faintspot.base.report.page import FigureWithData
 from faintspot.base.report.texts import Texts, plain_number
@@ -18,8 +19,6 @@ from faintspot.slopes.recorded.statistics import MeasuredSlopes
 from faintspot.slopes.sensor.drawing import Arrows, Map, asinh_stretch, map_height
 from faintspot.slopes.sensor.layout import Layout
 from faintspot.slopes.spots.sodium import SodiumProfile
-
-Floats = NDArray[np.float64]
 
 _TEXT = Texts("faintspot.slopes.recorded")
 _MOST_MARKED = 150  # sub-apertures of the whole sensor's picture: of more, marks would hide the spots

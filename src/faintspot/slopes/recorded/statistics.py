@@ -15,13 +15,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from faintspot.base.arrays import Floats
 from faintspot.base.checks import finite_array
 from faintspot.base.flags import SubapertureFlag
 from faintspot.base.statistics import UNKNOWN, Estimate, absolute_errors, slope_statistics
 from faintspot.slopes.pipeline.slopes import Slopes
-
-Floats = NDArray[np.float64]
-
 
 _BLOCK_NUMBERS = 1 << 22  # numbers worked on at a time: bounds the memory of the double-precision copies
 

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from faintspot.base.arrays import Floats
 from faintspot.base.errors import InputError, errors_within
 from faintspot.io.fits_units import is_aot
 from faintspot.io.frames import FrameSource
@@ -19,8 +20,6 @@ from faintspot.slopes.camera.frame_checks import LargestValues, MeanFrame, are_r
 from faintspot.slopes.pipeline.configuration import Configuration
 from faintspot.slopes.pipeline.slope_pipeline import SlopePipeline
 from faintspot.slopes.sensor.layout import Layout
-
-Floats = NDArray[np.float64]
 
 _LOOKS, _FRAMES = 20, 50  # stretches of frames over the whole recording
 _FRAMES_FOR_SATURATION = 200

@@ -6,9 +6,9 @@ import scipy.ndimage
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from faintspot.base.arrays import Floats
 from faintspot.base.statistics import MAD_TO_STD
 
-Floats = NDArray[np.float64]
 Points = NDArray[np.complex128]
 Pixels = tuple[NDArray[np.int64], NDArray[np.int64]]
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from faintspot.base.arrays import Floats
 from faintspot.base.files import write_atomically
 from faintspot.base.report.plots import (
     COLOUR_MAP,
@@ -33,8 +34,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.colors import FuncNorm
 
-
-Floats = NDArray[np.float64]
 
 MOST_WITH_GAPS = 600
 """Number of sub-apertures above which gaps and outlines are left out, because they cause a moiré pattern."""

@@ -6,11 +6,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from faintspot.base.arrays import Floats
 from faintspot.base.errors import InputError
 from faintspot.base.flags import UNMEASURED, SubapertureFlag
 from faintspot.slopes.sensor.layout import Layout
-
-Floats = NDArray[np.float64]
 
 _DISK_CORNERS = 256
 _WHOLE = 1.0  # misfit, in lenslets, that a disk around whole lenslets may have more than the best one

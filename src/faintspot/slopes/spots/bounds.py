@@ -11,14 +11,13 @@ from typing import Any, NamedTuple, Unpack
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from faintspot.base.arrays import Floats
 from faintspot.base.checks import number_between, numbers_between, one_of
 from faintspot.base.errors import InputError
 from faintspot.slopes.camera.detector import Detector, detector_or_default
 from faintspot.slopes.spots.fixed_weights import STEP_PX, images_with_derivatives
 from faintspot.slopes.spots.psf import PSF
 from faintspot.slopes.spots.shapes import SpotShape, image_shape, per_spot, position_array, spots
-
-Floats = NDArray[np.float64]
 
 SMALLEST_MEAN_E = 1e-6
 """Pixels with a smaller mean [photo-electrons] count as having it."""

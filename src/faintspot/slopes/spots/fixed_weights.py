@@ -8,13 +8,12 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from faintspot.base.arrays import Floats
 from faintspot.base.checks import finite_array, number_between, numbers_between
 from faintspot.base.errors import InputError
 from faintspot.slopes.spots.psf import PSF, Indexed
-
-Floats = NDArray[np.float64]
 
 STEP_PX = 0.01
 """Step of the differences for a PSF: a small part of a pixel, far above the rounding of the images."""

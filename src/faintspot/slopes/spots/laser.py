@@ -5,16 +5,15 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from faintspot.base.arrays import Floats
 from faintspot.base.checks import number_between, numbers_between
 from faintspot.base.errors import InputError
 from faintspot.base.files import check_size
 from faintspot.slopes.spots.psf import PSF
 from faintspot.slopes.spots.shapes import image_shape, position_array
 from faintspot.slopes.spots.sodium import SodiumProfile, integration_points
-
-Floats = NDArray[np.float64]
 
 _OVERSAMPLING = 4  # nodes of a PSF per pixel
 _SPOT_REACH = 2.5  # FWHM of the spot beyond the ends of the profile

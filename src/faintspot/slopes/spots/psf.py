@@ -9,12 +9,11 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from faintspot.base.arrays import Floats
 from faintspot.base.checks import LARGEST_FLOAT32, number_between, numbers_between
 from faintspot.base.errors import InputError
 from faintspot.base.files import NpzFile, check_size
 from faintspot.slopes.spots.shapes import image_shape, per_spot, position_array, spots
-
-Floats = NDArray[np.float64]
 
 _ANALYTIC_OVERSAMPLING = 8
 _LARGEST_RADIUS_PX = 128.0  # a window of the largest size needs 91 from corner to corner

@@ -9,11 +9,10 @@ from typing import Any, NamedTuple, TypedDict
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from faintspot.base.arrays import Floats
 from faintspot.base.checks import finite_array, numbers_between, one_of
 from faintspot.base.errors import InputError
 from faintspot.base.files import check_size
-
-Floats = NDArray[np.float64]
 
 SMALLEST_SIZE = 0.05
 """Smallest spot size accepted, 0.1 px wide: narrower rotated spots need more samples."""

@@ -7,14 +7,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from faintspot.base.arrays import Floats
 from faintspot.base.checks import number_between, numbers_between
 from faintspot.base.errors import InputError
 from faintspot.base.files import NpzFile
 from faintspot.slopes.spots.shapes import FWHM_TO_STD
-
-Floats = NDArray[np.float64]
 
 _HIGHEST_M = 1e6
 _MOST_BINS = 4096

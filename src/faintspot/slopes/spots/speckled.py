@@ -7,11 +7,10 @@ from typing import NamedTuple, Required, TypedDict, Unpack
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from faintspot.base.arrays import Floats
 from faintspot.base.checks import finite_array, number_between, numbers_between, spawn
 from faintspot.base.errors import InputError
 from faintspot.slopes.spots.shapes import SMALLEST_SIZE, image_shape, per_spot, structure_function
-
-Floats = NDArray[np.float64]
 
 LARGEST_D_OVER_R0 = 10.0
 """Largest sub-aperture side accepted, in r0: the phase grid has four points per r0."""

@@ -7,15 +7,14 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.optimize import minimize_scalar
 
+from faintspot.base.arrays import Floats
 from faintspot.base.checks import finite_array
 from faintspot.base.errors import InputError
 from faintspot.slopes.pipeline.slopes import Slopes
 from faintspot.slopes.spots.psf import PSF
-
-Floats = NDArray[np.float64]
 
 _BLOCKS = 20  # of frames, whose scatter says the error: noise and turbulence are correlated for shorter
 _FEWEST_FRAMES = 2 * _BLOCKS

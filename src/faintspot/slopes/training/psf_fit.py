@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 from scipy.interpolate import BSpline
 from scipy.linalg import solve
 
-from faintspot.slopes.training.registration import FINE, Floats, Sums, offsets
+from faintspot.base.arrays import Floats
+from faintspot.slopes.training.registration import FINE, Sums, offsets
 
 NODES_PER_PX = 2
 _MOST_NODES = 41  # along one axis, for what is not a product

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
+from faintspot.base.arrays import Floats
 from faintspot.base.errors import InputError
 from faintspot.base.flags import KEEPABLE, SubapertureFlag, leave_out
 from faintspot.slopes.camera.calibration import Calibration
@@ -21,7 +22,6 @@ from faintspot.slopes.sensor.layout import Layout
 from faintspot.slopes.spots.psf import PSF
 from faintspot.slopes.training.psf_fit import FIRST_FORM, choose_form, fit_psf, samples_of
 from faintspot.slopes.training.registration import (
-    Floats,
     Integers,
     PSFTables,
     Registered,

@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
+from faintspot.base.arrays import Floats
 from faintspot.slopes.spots.psf import PSF
 
-Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
 FINE = 8

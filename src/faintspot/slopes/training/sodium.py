@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from faintspot.base.arrays import Floats
 from faintspot.base.checks import finite_array, not_none, number_between, numbers_between
 from faintspot.base.errors import InputError
 from faintspot.slopes.camera.calibration import Calibration
@@ -18,8 +19,6 @@ from faintspot.slopes.spots.laser import LaserGuideStar, gaussian_spot
 from faintspot.slopes.spots.laser_spots import psf_in_window
 from faintspot.slopes.spots.psf import PSF
 from faintspot.slopes.spots.sodium import SodiumProfile
-
-Floats = NDArray[np.float64]
 
 _ROUNDS = 3  # fluxes and weights follow the profile
 _RIDGE = 1e-9  # relative to the mean information on an altitude

@@ -8,12 +8,11 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from faintspot.base.arrays import Floats
 from faintspot.base.checks import image_stack, number_between
 from faintspot.slopes.camera.calibration import Calibration
 from faintspot.slopes.spots.psf import PSF
 from faintspot.slopes.training.psf_learning import LearntPSF, learn_psf_from_images
-
-Floats = NDArray[np.float64]
 
 _ROUNDS = 2  # of learning the PSF: the noise found in one weights the pixels of the next
 _ITERATIONS = 10

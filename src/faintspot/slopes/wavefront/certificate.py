@@ -9,16 +9,14 @@ to the Bootstrap).
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import stdtrit
 
+from faintspot.base.arrays import Floats
 from faintspot.base.checks import number_between
 from faintspot.base.errors import InputError
 from faintspot.base.statistics import SEED, UNKNOWN, Estimate
 from faintspot.slopes.wavefront.fit import NM, Wavefront
 from faintspot.slopes.wavefront.zernike import zernike
-
-Floats = NDArray[np.float64]
 
 _POINTS, _COARSE = 200, 70  # along the diameter, for the rms and for PV
 _AROUND = 256  # points on the edge of the disk

@@ -5,11 +5,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from faintspot.base.arrays import Floats
 from faintspot.base.errors import InputError
 from faintspot.slopes.pipeline.slopes import Slopes
 from faintspot.slopes.sensor.layout import Layout
-
-Floats = NDArray[np.float64]
 
 _NEGLIGIBLE = 1e-9  # of the largest singular value
 

@@ -5,12 +5,13 @@ from typing import Any
 
 import numpy as np
 
+from faintspot.base.arrays import Floats
 from faintspot.base.files import check_ending, write_atomically
 from faintspot.base.report.texts import NOTHING, Texts, number_or_dash, signed
 from faintspot.base.statistics import Estimate
 from faintspot.base.text_files import to_json
 from faintspot.slopes.wavefront.certificate import Certificate, Drift, certify
-from faintspot.slopes.wavefront.fit import NM, Floats, Wavefront, total
+from faintspot.slopes.wavefront.fit import NM, Wavefront, total
 from faintspot.slopes.wavefront.zernike import mode_name, noll_to_nm, osa_index
 
 _TEXT = Texts("faintspot.slopes.wavefront")

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.special import stdtrit
 
+from faintspot.base.arrays import Floats
 from faintspot.base.checks import not_none, number_between
 from faintspot.base.errors import InputError
 from faintspot.base.flags import SubapertureFlag, are_valid, leave_out
@@ -16,8 +17,6 @@ from faintspot.slopes.pipeline.slopes import Slopes
 from faintspot.slopes.sensor.layout import Layout
 from faintspot.slopes.sensor.pupil import Pupil, inside_pupil, lenslet_outlines, lit_outlines, pupil_of
 from faintspot.slopes.wavefront.zernike import mean_gradients, zernike
-
-Floats = NDArray[np.float64]
 
 NM = "nm"
 """Unit of wavefronts where the layout tells the angle of a pixel and the size of the pupil."""

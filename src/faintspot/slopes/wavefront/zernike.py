@@ -4,10 +4,10 @@ Noll (1976), JOSA 66, 207: mode j has mean square 1 over the unit disk, and even
 """
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.special import eval_jacobi
 
-Floats = NDArray[np.float64]
+from faintspot.base.arrays import Floats
 
 _FOILS = "astigmatism", "trefoil", "tetrafoil", "pentafoil", "hexafoil", "heptafoil", "octafoil"
 _RANKS = "", "secondary ", "tertiary ", "quaternary "

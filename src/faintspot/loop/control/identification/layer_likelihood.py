@@ -17,12 +17,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
+from faintspot.base.arrays import Floats
 from faintspot.base.errors import InputError
 from faintspot.loop.control.identification.slope_spectra import SlopeRecords, SlopeSpectra
 from faintspot.loop.control.identification.vibrations import MODES, Vibration, mode_shapes
 from faintspot.loop.turbulence_strength import OUTER_SCALE_SPREAD
 
-Floats = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 
 _WINDOW_S, _WINDOW, _SHORTEST_WINDOW = 0.5, 64, 16

@@ -10,9 +10,9 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import minimize
 
+from faintspot.base.arrays import Floats
 from faintspot.loop.control.base import OpenLoopTelemetry
 from faintspot.loop.control.identification.layer_likelihood import LayerLikelihood, Layers
 from faintspot.loop.control.identification.slope_spectra import SlopeRecords
@@ -27,8 +27,6 @@ from faintspot.loop.control.identification.vibrations import (
 )
 from faintspot.loop.control.kalman.predictor import SlopeModel
 from faintspot.loop.slope_covariance import SlopeTurbulence
-
-Floats = NDArray[np.float64]
 
 _MOST = 6
 _FIRST_BIN = 2

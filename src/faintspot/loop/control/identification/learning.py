@@ -16,6 +16,7 @@ from typing import Generic, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from faintspot.base.arrays import Floats
 from faintspot.base.errors import InputError
 from faintspot.loop.control.base import ASSUMED, LEARNT, SETTLE_FRAMES, OpenLoopTelemetry
 from faintspot.loop.control.flattening import phase_of_commands
@@ -91,8 +92,6 @@ def _fits(
     # A line that the winds explain is no vibration in either model.
     return [windy, replace(anywhere, vibrations=windy.vibrations)]
 
-
-Floats = NDArray[np.float64]
 
 JUDGED_PART = 0.35
 """Part of a stretch, its end, on which models are judged; they are learnt from the rest."""

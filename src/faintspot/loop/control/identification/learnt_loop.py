@@ -4,8 +4,8 @@ import math
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from faintspot.base.arrays import Floats
 from faintspot.base.errors import InputError
 from faintspot.loop.control.identification.layers import Identification, Identified
 from faintspot.loop.control.identification.learning import learn_controller
@@ -29,8 +29,6 @@ from faintspot.loop.control.identification.open_loop import (
 )
 from faintspot.loop.control.identification.recording import Prepared, Recording, prepared
 from faintspot.loop.control.integrator import LoopPlant
-
-Floats = NDArray[np.float64]
 
 _MOST_SIGMAS = 5.0  # of the commands that the turbulence asks for
 _MOST_OFF = 1.5  # ratio of the recorded gain and the advised one, above which the fallback has the latter

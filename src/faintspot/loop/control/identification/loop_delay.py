@@ -15,11 +15,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from faintspot.base.arrays import Floats
 from faintspot.base.errors import InputError
 from faintspot.loop.control.identification.slope_spectra import SlopeSpectra
 from faintspot.loop.slope_covariance import SlopeTurbulence
-
-Floats = NDArray[np.float64]
 
 _WINDOW, _WINDOW_S = 128, 0.52  # frames; a longer window if the frame rate is so high that these last longer
 _FEWEST_PIECES, _FEWEST_LONG_PIECES = 4, 12

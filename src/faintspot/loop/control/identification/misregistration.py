@@ -17,13 +17,12 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.linalg import splu
 
+from faintspot.base.arrays import Floats
 from faintspot.loop.control.identification.loop_delay import LoopDelay
 from faintspot.loop.control.identification.open_loop import Measured, runs_of
 from faintspot.loop.control.identification.recording import Recording
 from faintspot.loop.control.identification.slope_spectra import interpolated
 from faintspot.loop.control.kalman.predictor import SlopePredictor
-
-Floats = NDArray[np.float64]
 
 _OVERSAMPLED, _MARGIN = 4, 2  # nodes a sub-aperture; sub-apertures around the sensor
 _SMOOTHNESS = 1e-3  # of surfaces of the mirror, which follow slopes to 2e-4 of their power

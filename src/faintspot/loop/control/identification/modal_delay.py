@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 from scipy.signal import welch
 
+from faintspot.base.arrays import Floats
 from faintspot.base.errors import InputError
 from faintspot.loop.control.identification.loop_delay import (
     GAINS,
@@ -30,8 +31,6 @@ from faintspot.loop.control.identification.recording import Recording
 from faintspot.loop.control.identification.slope_noise import SlopeNoise
 from faintspot.loop.control.identification.vibrations import Vibration
 from faintspot.loop.control.reconstructor import check_controllable
-
-Floats = NDArray[np.float64]
 
 _WINDOW, _LONG_WINDOW, _FOR_LONG = 128, 256, 3200  # frames, and consecutive ones for the long window
 _MOST_MODES = 8

@@ -9,6 +9,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from faintspot.base.arrays import Floats
 from faintspot.base.errors import InputError
 from faintspot.base.files import read_arrays
 from faintspot.loop.control.base import OpenLoopTelemetry
@@ -33,8 +34,6 @@ from faintspot.loop.control.kalman.modal_predictor import (
 )
 from faintspot.loop.control.kalman.predictor import LARGEST_VARIANCE_PX2
 from faintspot.loop.control.reconstructor import make_reconstructor
-
-Floats = NDArray[np.float64]
 
 _LEAK = 0.01
 _RECORDED = (

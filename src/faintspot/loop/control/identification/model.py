@@ -11,9 +11,9 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
 
+from faintspot.base.arrays import Floats
 from faintspot.base.checks import numbers_between, one_of
 from faintspot.base.errors import InputError
 from faintspot.base.files import read_arrays, save_arrays, write_atomically
@@ -37,7 +37,6 @@ from faintspot.loop.control.kalman.predictor import MOST_SLOPES, SlopeModel, Slo
 if TYPE_CHECKING:
     from faintspot.loop.control.identification.layers import Identified
 
-Floats = NDArray[np.float64]
 
 _LAYERS = "first", "second", "driving_px2"
 _NOISE = "variance_px2", "covariance_xy_px2"

@@ -10,6 +10,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
+from faintspot.base.arrays import Floats
 from faintspot.base.errors import InputError
 from faintspot.loop.control.base import OpenLoopTelemetry
 from faintspot.loop.control.identification.layers import Identified
@@ -24,8 +25,6 @@ from faintspot.loop.control.identification.recording import Recording
 from faintspot.loop.control.identification.slope_noise import noise_of_slopes
 from faintspot.loop.slope_covariance import OUTER_SCALE_M, SlopeTurbulence
 from faintspot.loop.turbulence_strength import TurbulenceStrength
-
-Floats = NDArray[np.float64]
 
 FEWEST_FRAMES = 200
 _MOST_LOST = 0.3  # of the frames; with more, the longest run without a gap is used

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from faintspot.base.arrays import Floats
 from faintspot.base.checks import one_of, real_array
 from faintspot.base.errors import InputError
 from faintspot.loop.control.base import SETTLE_FRAMES, CommandDelayLine
@@ -35,7 +36,6 @@ from faintspot.loop.control.identification.model import Kalman, state_space, wri
 from faintspot.loop.control.identification.open_loop import Measured, Wind, open_loop_of
 from faintspot.loop.control.identification.recording import Recording
 
-Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]
 
 _MEASURED_FRAMES = 60  # that the integrator drives the mirror first, so that its residual is measured

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import csd, welch
 
+from faintspot.base.arrays import Floats
 from faintspot.base.checks import (
     finite_array,
     increasing,
@@ -30,8 +31,6 @@ from faintspot.loop.control.faults import (
 )
 from faintspot.loop.control.reconstructor import make_reconstructor
 from faintspot.loop.slope_covariance import modes_of_turbulence, order_remark
-
-Floats = NDArray[np.float64]
 
 _MOST_SENT_AFTER = 5  # frames
 _CLEAR = 0.5  # correlation of an integrator's steps with its slopes, above which their rows are known

@@ -12,14 +12,12 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter1d
 
+from faintspot.base.arrays import Floats
 from faintspot.loop.control.identification.loop_delay import FEWEST_SUBAPERTURES, INDEPENDENT, bins_of
 from faintspot.loop.control.identification.slope_spectra import SlopeSpectra
 from faintspot.loop.slope_covariance import SlopeTurbulence
-
-Floats = NDArray[np.float64]
 
 _LENGTHS, _EVERY = (128, 64, 32, 16), (1, 2, 3)  # frames of a piece, and steps between these
 _FEWEST_PIECES, _COVERED = 6, 0.5  # least part of the measured slopes in whole pieces

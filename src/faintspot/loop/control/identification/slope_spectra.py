@@ -18,13 +18,12 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.ndimage import spline_filter
 
+from faintspot.base.arrays import Floats
 from faintspot.base.errors import InputError
 from faintspot.loop.control.base import OpenLoopTelemetry
 from faintspot.loop.control.identification.vibrations import mode_shapes
 from faintspot.loop.slope_covariance import SlopeTurbulence, gradient_covariances
 from faintspot.slopes.kernels.compiling import compiled_with
-
-Floats = NDArray[np.float64]
 
 _MOST_SUBAPERTURES = 60
 _LEAST_MEASURED, _LEAST_MEASURED_OF_WINDOW = 0.5, 0.8  # of frames, or of slopes

@@ -6,14 +6,12 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 from scipy.optimize import minimize
 from scipy.special import chdtri, gammainccinv, gammaincinv
 
+from faintspot.base.arrays import Floats
 from faintspot.loop.control.kalman.predictor import SlopeModel
-
-Floats = NDArray[np.float64]
 
 MODES = ("tip", "tilt", "focus")
 _SEGMENT_S = 2.0

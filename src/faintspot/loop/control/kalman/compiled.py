@@ -3,8 +3,8 @@
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from faintspot.base.arrays import Floats
 from faintspot.loop.control.base import (
     LEAST_VARIANCE_PX2,
     CommandDelayLine,
@@ -32,8 +32,6 @@ from faintspot.loop.control.kalman.kernels import (
     replay,
 )
 from faintspot.loop.control.kalman.predictor import SlopePredictor, shares
-
-Floats = NDArray[np.float64]
 
 STEPS = 4
 """Conjugate-gradient iterations used to compute the Kalman gain."""

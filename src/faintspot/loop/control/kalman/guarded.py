@@ -6,6 +6,7 @@ from abc import abstractmethod
 import numpy as np
 from numpy.typing import NDArray
 
+from faintspot.base.arrays import Floats
 from faintspot.loop.control.base import CommandDelayLine, Controller
 from faintspot.loop.control.faults import StuckWatch
 from faintspot.loop.control.kalman.guard import (
@@ -20,8 +21,6 @@ from faintspot.loop.control.kalman.guard import (
     new_guard,
     restart,
 )
-
-Floats = NDArray[np.float64]
 
 
 class GuardedController(Controller):

@@ -13,11 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
+from faintspot.base.arrays import Floats
 from faintspot.loop.control.kalman.predictor import LARGEST_VARIANCE_PX2
 from faintspot.loop.control.reconstructor import add_noise
 from faintspot.loop.slope_covariance import SlopeTurbulence
 
-Floats = NDArray[np.float64]
 Indices = NDArray[np.int32]
 
 _REACH = 1.5  # sub-apertures: with the diagonal neighbours

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from faintspot.base.arrays import Floats
 from faintspot.loop.control.kalman.local_model import (
     Indices,
     at_most,
@@ -25,7 +26,6 @@ from faintspot.loop.control.reconstructor import add_noise
 from faintspot.loop.slope_covariance import SlopeTurbulence
 from faintspot.slopes.kernels.compiling import Direct, compiled_with
 
-Floats = NDArray[np.float64]
 _Singles = NDArray[np.float32]
 
 _REACH_OF_COVARIANCE = 2.5

@@ -9,11 +9,12 @@ from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy import sparse
 from scipy.linalg import solve_toeplitz
 from scipy.signal import lfilter
 
+from faintspot.base.arrays import Floats
 from faintspot.loop.control.base import CommandDelayLine, ExpectedSlopes, without_prior
 from faintspot.loop.control.integrator import LoopPlant, SlopeProduct
 from faintspot.loop.control.kalman.guard import SURPRISE
@@ -21,8 +22,6 @@ from faintspot.loop.control.kalman.guarded import GuardedController
 from faintspot.loop.control.kalman.local_predictor import LocalPredictor
 from faintspot.loop.control.kalman.predictor import LARGEST_VARIANCE_PX2
 from faintspot.slopes.kernels.products import ProductPart
-
-Floats = NDArray[np.float64]
 
 ARRAYS = "coefficients", "gains", "coupling", "variance_px2", "predicted_px2"
 """Names of a filter's arrays."""

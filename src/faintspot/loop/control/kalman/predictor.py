@@ -5,12 +5,10 @@ from functools import cached_property
 from typing import Self
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
+from faintspot.base.arrays import Floats
 from faintspot.loop.control.reconstructor import add_noise, weighted_slopes
-
-Floats = NDArray[np.float64]
 
 _RIDGE = 1e-4  # of a slope's variance: what noise-free theory would demand of single slopes is not asked
 _LEAST_DRIVING = 1e-6  # of a slope's variance

@@ -9,6 +9,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from faintspot.base.arrays import Floats
 from faintspot.base.checks import LARGEST_FLOAT32
 from faintspot.base.errors import InputError
 from faintspot.base.options import Value, is_auto, option
@@ -28,8 +29,6 @@ from faintspot.slopes.estimators.registry import register
 from faintspot.slopes.estimators.sensor import PIXEL_BLUR_PX2, Scene, Sensor
 from faintspot.slopes.kernels import gravity
 from faintspot.slopes.kernels.groups import RANGE
-
-Floats = NDArray[np.float64]
 
 KEPT_FRACTION = 0.08  # of a window's pixels, if keep_brightest is not given: 20 of 16 x 16
 FEWEST_KEPT = 5

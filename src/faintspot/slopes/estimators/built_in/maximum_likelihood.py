@@ -12,6 +12,7 @@ from typing import Any, ClassVar, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from faintspot.base.arrays import Floats
 from faintspot.base.checks import not_none
 from faintspot.base.files import MOST_NUMBERS, check_size
 from faintspot.base.options import Value, option
@@ -25,8 +26,6 @@ from faintspot.slopes.estimators.spot_tables import SpotModel, model_of_psf
 from faintspot.slopes.kernels import fits as spot_fits
 from faintspot.slopes.kernels.groups import RANGE, flux_above_edges
 from faintspot.slopes.spots.psf import PSF
-
-Floats = NDArray[np.float64]
 
 _BLURS = (0.4, 0.0, 0.8, 1.2)  # of the PSF of a speckled spot, in units of lambda / d
 _MODEL_ERRORS = (0.3, 0.0, 1.0)  # for speckled spots

@@ -10,13 +10,14 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from faintspot.base.arrays import Floats
 from faintspot.base.checks import not_none
 from faintspot.base.errors import InputError
 from faintspot.base.options import PerSubaperture, Value, is_auto, option
 from faintspot.base.tables import FEW_KEPT, PRESETS, of_denoising
 from faintspot.slopes.estimators.automatic import automatic_smoothing, automatic_strength
 from faintspot.slopes.estimators.base import BACKGROUND, CALIBRATED, RAW, Estimator, Step, Style
-from faintspot.slopes.estimators.built_in.gravity import Floats, GravityPlan, KeepingBrightest
+from faintspot.slopes.estimators.built_in.gravity import GravityPlan, KeepingBrightest
 from faintspot.slopes.estimators.noise import ALGORITHMS, suggested_strength, tv_denoise
 from faintspot.slopes.estimators.registry import register
 from faintspot.slopes.estimators.sensor import Scene, Sensor

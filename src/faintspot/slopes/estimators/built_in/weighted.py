@@ -10,6 +10,7 @@ from typing import Any, ClassVar, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from faintspot.base.arrays import Floats
 from faintspot.base.options import Value, option
 from faintspot.base.tables import PRESETS
 from faintspot.slopes.estimators import spot_tables
@@ -20,8 +21,6 @@ from faintspot.slopes.estimators.spot_tables import SpotModel
 from faintspot.slopes.kernels import fits as spot_fits
 from faintspot.slopes.kernels.brightest import SMALLEST_VARIANCE
 from faintspot.slopes.kernels.groups import RANGE
-
-Floats = NDArray[np.float64]
 
 _STEPS_IN_BRIGHT_FLUX = 12
 

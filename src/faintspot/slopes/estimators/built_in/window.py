@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from faintspot.base.arrays import Floats
 from faintspot.base.checks import not_none
 from faintspot.base.errors import InputError
 from faintspot.base.options import Value, option
@@ -23,8 +24,6 @@ from faintspot.slopes.kernels.groups import RANGE
 from faintspot.slopes.kernels.host import WIDTHS, lanes_for
 from faintspot.slopes.spots.fixed_weights import FixedWeights
 from faintspot.slopes.spots.shapes import FWHM_TO_STD
-
-Floats = NDArray[np.float64]
 
 _WIDTHS = (1.25, 0.8, 1.0, 1.6, 2.0, 2.8)  # multiples of the spot's width
 _WIDTHS_OF_SPECKLES = (2.0, 1.0, 1.25, 1.6, 2.8, 4.0)
