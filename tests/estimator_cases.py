@@ -52,7 +52,7 @@ class Case:
         }
         psf = self.psf
         if psf is not None and psf.index is not None:
-            psf = PSF(psf.samples, psf.oversampling, psf.index[places])
+            psf = one_of_several(psf.index[places])
         prior = None if self.prior is None else self.prior[places]
         settings, calibration = self.settings.replace(**per_image), self.calibration
         if isinstance(calibration.read_noise_e, np.ndarray):
@@ -76,6 +76,13 @@ def several_psfs() -> PSF:
         )
     ]
     return PSF(np.stack(kinds), 8, [0, 1, 2])
+
+
+def one_of_several(index: NDArray[Any]) -> PSF:
+    """One of those for each spot; decomposed once, which takes longer than most tests."""
+    psf = PSF(several_psfs().samples, 8, index)
+    psf.__dict__["separable_terms"] = several_psfs().separable_terms
+    return psf
 
 
 @cache
@@ -142,7 +149,7 @@ def random_case(
     n = int(rng.integers(1, 13)) if n is None else n
     psf = one_psf()
     if rng.random() < 0.6:
-        psf = PSF(several_psfs().samples, 8, rng.integers(0, 3, n))
+        psf = one_of_several(rng.integers(0, 3, n))
     noise, background = float(rng.choice([0.1, 0.3, 1.0, 3.0])), float(rng.choice([0.0, 2.0]))
     detector = fs.slopes.simulate.Detector(
         noise,

@@ -258,15 +258,16 @@ def grid_posterior(g: ArrayLike, task: Task, flux: float, xs: Floats, ys: Floats
     logarithm = np.full((len(ys), len(xs)), -np.inf)
     for j, y in enumerate(ys):
         for i, x in enumerate(xs):
-            m = np.maximum(flux * task.spot.images(x, y, g.shape)[0], 0.0)
-            q = (g + v / e) / e * np.log(1.0 + e * m / v) - m / e
-            distance = ((x - task.prior[0]) ** 2 + (y - task.prior[1]) ** 2) / task.prior_std**2
             share = max(min(x + cell / 2, high_x) - max(x - cell / 2, low_x), 0.0)
             share *= max(min(y + cell / 2, high_y) - max(y - cell / 2, low_y), 0.0)
             away = max(abs(x - task.prior[0]), abs(y - task.prior[1]))
             share *= away <= PRIOR_REACH * task.prior_std
-            if share > 0:
-                logarithm[j, i] = task.rounded_sum(q) - distance / 2 + math.log(share)
+            if not share > 0:
+                continue
+            m = np.maximum(flux * task.spot.images(x, y, g.shape)[0], 0.0)
+            q = (g + v / e) / e * np.log(1.0 + e * m / v) - m / e
+            distance = ((x - task.prior[0]) ** 2 + (y - task.prior[1]) ** 2) / task.prior_std**2
+            logarithm[j, i] = task.rounded_sum(q) - distance / 2 + math.log(share)
     if np.isneginf(logarithm).all():
         return Estimate(*task.prior, flux, 0.0, 0.0)
     p = np.exp(logarithm - logarithm.max())

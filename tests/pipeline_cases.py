@@ -43,10 +43,9 @@ def random_layout(rng: np.random.Generator) -> fs.Layout:
     return fs.Layout(grid.frame_shape, grid.window, grid.corners, centres)
 
 
-def random_settings(rng: np.random.Generator, n: int, pixels: int, denoised: bool = False) -> fs.Settings:
+def random_settings(rng: np.random.Generator, n: int, pixels: int, algorithm: str) -> fs.Settings:
     """Different settings for every sub-aperture. "threshold" is not continuous in the image and can only be
-    compared where the image is exact, without denoising. Some sensors' estimator does not denoise at all,
-    unless `denoised`.
+    compared where the image is exact, without denoising. Some sensors' estimator does not denoise at all.
     """
     rule = rng.choice(["subtract_next", "threshold", "subtract_kth"], n)
     strength = rng.uniform(0.0, 6.0, n) * rng.integers(0, 2, n) + 0.3
@@ -56,14 +55,14 @@ def random_settings(rng: np.random.Generator, n: int, pixels: int, denoised: boo
         "flux_floor": rng.choice([1e-4, 0.1], n),
         "max_bad_fraction": rng.choice([0.0, 0.05, 0.25, 1.0], n),
     }
-    if rng.random() < 0.2 and not denoised:
+    if rng.random() < 0.2:
         return fs.Settings("brightest", **shared)
     return fs.Settings(
         "tv",
         noise_std=np.where((rule != "threshold") & (rng.random(n) < 0.8), strength, 0.0),
         tolerance=rng.choice([0.0, 1e-2, 0.1], n),
         max_iterations=rng.integers(1, 40, n),
-        algorithm=str(rng.choice(["fgp", "chambolle"])),
+        algorithm=algorithm,
         preset=str(rng.choice(["accurate", "fast"])),
         **shared,
     )
@@ -87,7 +86,7 @@ def random_calibration(rng: np.random.Generator, shape: tuple[int, int]) -> fs.C
     )
 
 
-def random_case(seed: int, dtype: str) -> Case:
+def random_case(seed: int, dtype: str, algorithm: str = "fgp") -> Case:
     rng = np.random.default_rng(seed)
     layout = random_layout(rng)
     height, width = layout.frame_shape
@@ -106,7 +105,7 @@ def random_case(seed: int, dtype: str) -> Case:
     return Case(
         np.clip(frame, low, high).astype(kind),
         layout,
-        random_settings(rng, len(layout), layout.pixels),
+        random_settings(rng, len(layout), layout.pixels, algorithm),
         random_calibration(rng, (height, width)),
         rng.uniform(-0.5, 0.5, (len(layout), 2)),
     )

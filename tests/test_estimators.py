@@ -16,7 +16,8 @@ from tests.patience import examples
 
 import faintspot as fs
 from faintspot.slopes.estimators import estimators
-from faintspot.slopes.kernels.groups import new_scratch
+from faintspot.slopes.kernels.groups import Scratch
+from faintspot.slopes.kernels.parallel import run_groups
 from faintspot.slopes.pipeline.following import measure_images
 from faintspot.slopes.spots.bounds import cramer_rao
 from faintspot.slopes.spots.psf import PSF
@@ -140,7 +141,7 @@ class TestIndependence:
 
     @EVERY
     def test_threads_and_frames(self, estimator: str) -> None:
-        case = random_case(5, estimator, n=19)
+        case = random_case(5, estimator, n=19, window=(9, 11))
         height, width = case.layout.frame_shape
         frames = np.stack([case.images.reshape(height, width)] * 4)
         frames += np.arange(4, dtype=np.float32)[:, None, None]
@@ -279,8 +280,11 @@ class TestLocalBackground:
         flux = np.empty((1, 40), np.float32)
         frame = case.images.reshape(1, -1, 12)
         source = pipeline.source(frame, frame.dtype)
-        scratch = new_scratch(source.lanes, 12, 12)
-        pipeline.plan.prepared.flux_kernel(source, 0, -(-40 // pipeline.width), scratch, flux)
+
+        def job(start: int, stop: int, scratch: Scratch) -> None:
+            pipeline.plan.flux_kernel(source.frames)(source, start, stop, scratch, flux)
+
+        run_groups(job, -(-40 // pipeline.width), source.lanes, (12, 12))
         assert flux.mean() == pytest.approx(500.0, rel=0.1)
         assert np.mean(np.abs(pipeline(frame[0]).flux - 500.0) < 100.0) > 0.95
 

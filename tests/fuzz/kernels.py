@@ -18,9 +18,9 @@ from tests.estimator_cases import (
     NEED_PSF,
     assert_same,
     assert_sane,
+    one_of_several,
     one_psf,
     random_case,
-    several_psfs,
     with_options,
 )
 from tests.estimator_oracle import assert_equals_oracle
@@ -84,7 +84,7 @@ def _pipeline(rng: np.random.Generator, estimator: str, width: int) -> fs.SlopeP
     settings = with_options(settings, **_extremes(rng, settings))
     psf = None
     if estimator in NEED_PSF:
-        kinds = PSF(several_psfs().samples, 8, rng.integers(0, 3, n))
+        kinds = one_of_several(rng.integers(0, 3, n))
         psf = [one_psf(), kinds, PSF.analytic("gaussian", size=0.3, radius_px=3)][rng.integers(3)]
     reference = rng.uniform(-1, 1, (n, 2)) * rng.choice([1.0, 30.0])
     calibration = _calibration(rng, layout.frame_shape)

@@ -25,6 +25,13 @@ class TestAgainstOracle:
         assert_equals_oracle(case, case.pipeline()(case.frame))
 
     @pytest.mark.slow
+    @pytest.mark.parametrize("dtype", ["uint16", "float32"])
+    @given(seed=st.integers(0, 2**32 - 1))
+    def test_random_sensors_with_the_other_algorithm(self, dtype: str, seed: int) -> None:
+        case = random_case(seed, dtype, "chambolle")
+        assert_equals_oracle(case, case.pipeline()(case.frame))
+
+    @pytest.mark.slow
     def test_the_widest_simd_width(self) -> None:
         """At 4 lanes each family is compared with the usual width, which is compared above."""
         for seed in range(20):

@@ -41,7 +41,8 @@ BRIGHT_E = 100.0
 """Least flux in the box of typical spots [electrons]: photon noise alone never leaves one dark."""
 SUSPECT = 0.5
 """Flux over the typical one below which the pixels of a window are looked at."""
-MOST_LANES = 16
+MOST_LANES = 8
+"""Largest number of pixels at once: windows are rarely wider, and each number is compiled for itself."""
 _ABSOLUTE_TO_STD = 0.5 * math.sqrt(math.pi)  # of the mean absolute difference of two pixels
 
 

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from faintspot.base.checks import not_none, number_between, numbers_between, real_array
 from faintspot.base.errors import InputError
-from faintspot.slopes.kernels.dark import LightTest, scratch_size, significances
+from faintspot.slopes.kernels.dark import MOST_LANES, LightTest, scratch_size, significances
 from faintspot.slopes.kernels.host import WIDTHS, lanes_for
 from faintspot.slopes.sensor.layout import Layout
 
@@ -47,7 +47,8 @@ def light_test(
         trials = min(_BOXES / box**2, 1.0) * ny * nx * boxes
         limit = NormalDist().inv_cdf((1.0 - FALSE_LIGHT) ** (1.0 / trials))
         unit = math.sqrt(box**2 + _MEDIAN_OF_FOUR * box**4 / (0.5 * (ny + nx)))
-    lanes = lanes_for(np.float32, max(width for width in WIDTHS if width <= max(nx, min(WIDTHS))))
+    most = min(max(nx, min(WIDTHS)), MOST_LANES)
+    lanes = lanes_for(np.float32, max(width for width in WIDTHS if width <= most))
     last = np.zeros(lanes.width, np.float32)
     last[lanes.width - nx % lanes.width :] = 1.0
     corners, numbers = np.ascontiguousarray(layout.corners), (np.float32(limit), np.float32(unit))
