@@ -32,7 +32,7 @@ def test_reflection_spoils_no_settings_and_slopes(folder: Path, run: Commands, r
     known = configuration.Configuration("new.toml")
     assert float(out.split("flux of a spot ")[1].split()[0]) == pytest.approx(1000.0, rel=0.05)
     assert known.settings.spot_fwhm_px == pytest.approx(4.7, rel=0.05)
-    slopes = SlopePipeline(known.layout, known.settings, known.calibration)(pixels)
+    slopes = SlopePipeline(known.layout, known.settings, known.calibration)(pixels.astype(np.float32))
     positions = known.layout.centres + np.stack([slopes.x, slopes.y], axis=1)
     errors = positions - spots[cKDTree(spots).query(window_middles(known.layout))[1]]
     far = np.hypot(*(known.layout.centres - (np.array(pixels.shape) - 1) / 2).T) > 96

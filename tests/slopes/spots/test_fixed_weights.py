@@ -126,9 +126,10 @@ def test_dark_flat_gain_and_bad_pixels(fwhm_px: float) -> None:
 
 def test_saturated_pixels_that_count() -> None:
     layout = fs.Layout.grid((1, 2), pixels=16)
-    frame = np.full(layout.frame_shape, 10, np.uint16)
+    frame = np.full(layout.frame_shape, 10, np.float32)
     frame[8, 8] = frame[0, 16] = 65535
-    flags = fs.SlopePipeline(layout, window(2.0), fs.Calibration(read_noise_e=2.0))(frame).flags
+    calibration = fs.Calibration(read_noise_e=2.0, saturation_adu=65535.0)
+    flags = fs.SlopePipeline(layout, window(2.0), calibration)(frame).flags
     assert ((flags & fs.SubapertureFlag.SATURATED) != 0).tolist() == [True, False]
 
 
