@@ -94,3 +94,43 @@ def test_packages_name_modules_that_exist() -> None:
             if not (path.with_name(f"{name}.py").exists() or path.with_name(name).is_dir())
         ]
     assert unknown == []
+
+
+OF_OTHERS = {
+    "with",
+    "ShackHartmannWavefrontSensorEstimator",
+    "ShSlopec",
+    "Modalrec",
+    "out_slopes",
+    "mmirs_wfs_0150.fits",
+}
+"""Names in docstrings that are Python's, those of tools that adapters serve, or a file."""
+
+
+def test_names_in_docstrings_exist() -> None:
+    """Between single backquotes: modules, and what some module defines, takes or uses."""
+    root, modules, names, cited = Path(faintspot.__file__).parent, set[str](), set(OF_OTHERS), []
+    for path in root.rglob("*.py"):
+        parts = path.relative_to(root).with_suffix("").parts
+        modules |= {".".join(parts[i:]) for i in range(len(parts))}
+        modules |= {".".join(parts[i:-1]) for i in range(len(parts) - 1)}
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            names |= {
+                str(value) for name, value in ast.iter_fields(node) if name in ("name", "id", "attr", "arg")
+            }
+            if isinstance(node, ast.Constant) and isinstance(node.value, str):
+                if re.fullmatch(r"[\w.]+", node.value):
+                    names.add(node.value)
+                words = re.findall(r"(?<!`)`([A-Za-z_][\w.]*)`(?!`)", node.value)
+                cited += [(path.relative_to(root).as_posix(), word) for word in words]
+    packages = {path.name for path in root.iterdir() if path.is_dir()}
+
+    def exists(word: str) -> bool:
+        owner, _, last = word.removeprefix("faintspot.").rpartition(".")
+        if owner.split(".")[0] in packages and not re.search("[A-Z]", owner):
+            return f"{owner}.{last}" in modules or (owner in modules and last in names)
+        return word in modules or (last in names and (not owner or owner in modules | names or exists(owner)))
+
+    files = {path.name for path in root.rglob("*") if path.suffix in (".toml", ".npz", ".c", ".h")}
+    unknown = [f"{where}: {word}" for where, word in cited if not (exists(word) or word in files)]
+    assert "\n".join(unknown) == ""

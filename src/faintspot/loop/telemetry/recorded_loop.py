@@ -77,7 +77,7 @@ def read_recorded_loop(
     path : path
         A store of `faintspot realtime record`, slopes of `faintspot slopes` without a loop, an AOT file, a
         telemetry session of pyRTC, streams of milk's logger, a file or folder in one of the layouts of
-        `io.loops.layouts`, a TOML file that names arrays, or a file with slopes.
+        `io.loop_layouts`, a TOML file that names arrays, or a file with slopes.
     system : path, optional
         TOML with values that the recording lacks, or that replace its own.
     configuration : path, optional

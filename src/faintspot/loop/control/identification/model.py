@@ -301,7 +301,7 @@ def state_space(model: Kalman, plant: LoopPlant, scale: Floats | float, sign: fl
         command = command_of_state x + command_of_slopes s + command_of_mirror u
         x = state_of_state x + state_of_slopes s + state_of_mirror u
 
-    Of a large sensor, with the latest command v, all `_of_state` and `_of_surprise` of the state sparse::
+    Of a large sensor, with the latest command v, all matrices of state and surprise sparse::
 
         surprise = s - slopes_of_state x - slopes_of_mirror u
         command = v - command_of_ahead (ahead_of_state x + slopes_of_mirror v) + command_of_surprise surprise

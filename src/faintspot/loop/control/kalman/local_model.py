@@ -231,7 +231,7 @@ def replies(arrays: Mapping[str, Any], frames: int) -> Iterator[sparse.csr_matri
     Parameters
     ----------
     arrays : mapping
-        As from `local_kalman.local_filter`.
+        As from `local_filter`.
     frames : int
         For how many frames later the slopes are predicted.
     """
