@@ -27,7 +27,7 @@ OF_THE_PROGRAM = {
     "slopes/kernels/groups.py driver_of",
     "slopes/kernels/streaming.py streamed",
     "slopes/kernels/parallel.py _pool",
-    "slopes/kernels/flat_start.py flat_start_table",
+    "slopes/kernels/total_variation/flat_start.py flat_start_table",
     "slopes/pipeline/slope_pipeline.py _checks",
 }
 """Without a bound: of nothing, types, kernels, or sizes, of which a program has few; a few kB each."""

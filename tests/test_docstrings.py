@@ -102,9 +102,8 @@ OF_OTHERS = {
     "ShSlopec",
     "Modalrec",
     "out_slopes",
-    "mmirs_wfs_0150.fits",
 }
-"""Names in docstrings that are Python's, those of tools that adapters serve, or a file."""
+"""Names in docstrings that are Python's, or those of tools that adapters serve."""
 
 
 def test_names_in_docstrings_exist() -> None:
@@ -134,3 +133,12 @@ def test_names_in_docstrings_exist() -> None:
     files = {path.name for path in root.rglob("*") if path.suffix in (".toml", ".npz", ".c", ".h")}
     unknown = [f"{where}: {word}" for where, word in cited if not (exists(word) or word in files)]
     assert "\n".join(unknown) == ""
+
+
+def test_files_of_the_journeys_exist() -> None:
+    """In CONTRIBUTING: from a frame to a command, from a recording to a filter."""
+    root = Path(faintspot.__file__).parent
+    text = (Path(__file__).parents[1] / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    files = re.findall(r"(?m)^\| `([\w/]+\.py)` \|", text)
+    assert len(files) > 15
+    assert [file for file in files if not (root / file).is_file()] == []

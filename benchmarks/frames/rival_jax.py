@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.frames.rival_numpy import FIRST_MULTIPLIER, momenta
-from faintspot.slopes.kernels.sweeps import FGP_STEP
+from faintspot.slopes.kernels.total_variation.sweeps import FGP_STEP
 
 # Must be in the environment before JAX is first imported.
 ONE_THREAD = "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"

@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.slopes.kernels.sweeps import FGP_STEP
+from faintspot.slopes.kernels.total_variation.sweeps import FGP_STEP
 
 Floats = NDArray[np.float32]
 

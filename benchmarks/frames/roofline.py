@@ -39,7 +39,7 @@ from benchmarks.frames.sweeps import SIDE, Group, numba_sweeps
 from benchmarks.measuring import Candidate, Row, Table, Times, best, interleaved, median_ratio, pinned, spread
 from faintspot.slopes.kernels.compiling import compile_target
 from faintspot.slopes.kernels.host import aligned_zeros
-from faintspot.slopes.kernels.sweeps import STATE_VECTORS
+from faintspot.slopes.kernels.total_variation.sweeps import STATE_VECTORS
 
 WIDTHS = (16, 8, 4)
 TARGET = 0.85

@@ -6,10 +6,10 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from faintspot.slopes.kernels import sweeps as kernel
-from faintspot.slopes.kernels.gravity import gravity_scratch
 from faintspot.slopes.kernels.host import lanes_for
+from faintspot.slopes.kernels.positions.gravity import gravity_scratch
 from faintspot.slopes.kernels.simd import splat, store
+from faintspot.slopes.kernels.total_variation import sweeps as kernel
 
 SIDE = 16
 MOMENTUM, INVERSE = 0.5, 0.3  # of an ordinary iteration; their values do not change the work

@@ -12,7 +12,7 @@ import numpy as np
 from benchmarks.loops.prediction import SETTLE, VIBRATION_NM, Case, Floats, Run
 from benchmarks.measuring import Row, Table
 from faintspot.base.statistics import paired_mean
-from faintspot.engine.guard import ControllerSuccessor, PreparedController
+from faintspot.engine.control.guard import ControllerSuccessor, PreparedController
 from faintspot.loop.control.base import ASSUMED, WINDS, CommandDelayLine, Controller
 from faintspot.loop.control.identification.learning import RelearntControl, relearn
 from faintspot.loop.control.identification.model import Kalman

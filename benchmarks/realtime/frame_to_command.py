@@ -34,11 +34,11 @@ import faintspot as fs
 from benchmarks.loops.control import random_filter
 from benchmarks.measuring import Row, Table
 from benchmarks.realtime import pyrtc
-from faintspot.engine.child_processes import real_time
 from faintspot.engine.engine import Engine
-from faintspot.engine.pixel_ring import PixelRing
-from faintspot.engine.plan import EngineOptions
-from faintspot.engine.timing import Latencies
+from faintspot.engine.frames.pixel_ring import PixelRing
+from faintspot.engine.frames.timing import Latencies
+from faintspot.engine.processes.child_processes import real_time
+from faintspot.engine.settings.plan import EngineOptions
 from faintspot.loop.control import integrator
 from faintspot.loop.control.base import CommandDelayLine, Controller
 from faintspot.loop.control.configuration import Control

@@ -24,9 +24,9 @@ from numpy.typing import NDArray
 from benchmarks.frames.rivals import problem
 from benchmarks.frames.scale import settings, settings_in_words
 from benchmarks.measuring import Row, Table, spread
-from faintspot.engine.child_processes import real_time
-from faintspot.engine.frame_path import FramePath, Progress
-from faintspot.engine.workers import Workers
+from faintspot.engine.frames.frame_path import FramePath, Progress
+from faintspot.engine.frames.workers import Workers
+from faintspot.engine.processes.child_processes import real_time
 from faintspot.slopes.kernels.parallel import available_cpus
 
 FRAMES = {36: 40_000, 1208: 5_000}

@@ -48,8 +48,8 @@ from benchmarks.measuring import (
     ratio,
     spread,
 )
-from faintspot.engine.frame_path import FramePath, Progress
-from faintspot.engine.requests import request, socket_path
+from faintspot.engine.frames.frame_path import FramePath, Progress
+from faintspot.engine.processes.requests import request, socket_path
 
 SIDE, PIXELS, LEVEL_ADU, RATE_HZ = 6, 16, 100, 300.0
 ROUNDS, FRAMES_A_ROUND, BATCH = 8, 300, 64

@@ -41,8 +41,8 @@ from numpy.typing import NDArray
 from benchmarks.measuring import Row, Table, Times, median_ratio, spread
 from benchmarks.realtime import pyrtc
 from benchmarks.realtime.pyrtc import LEVEL_ADU, PIXELS, RATE_HZ, SIDE
-from faintspot.engine.pixel_ring import PixelRing
-from faintspot.engine.requests import LENGTHY_TIMEOUT_S, request, socket_path
+from faintspot.engine.frames.pixel_ring import PixelRing
+from faintspot.engine.processes.requests import LENGTHY_TIMEOUT_S, request, socket_path
 from faintspot.loop.control.configuration import Control
 
 COMMANDS, GAIN, LEAK = 54, 0.4, 0.1

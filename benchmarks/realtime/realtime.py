@@ -24,8 +24,8 @@ from benchmarks.realtime.frame_to_command import command_table
 from benchmarks.realtime.realtime_processes import SMALL, USUAL, engine_and_camera
 from faintspot import Calibration, Layout, Settings, SlopePipeline
 from faintspot.engine.engine import Engine
-from faintspot.engine.pixel_ring import PixelRing
-from faintspot.engine.plan import EngineOptions
+from faintspot.engine.frames.pixel_ring import PixelRing
+from faintspot.engine.settings.plan import EngineOptions
 
 FRAMES, RATE_HZ, ROWS = 1500, 300, 112
 ROUNDS = 3

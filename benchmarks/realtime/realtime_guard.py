@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 
 from benchmarks.measuring import Row, Table
-from faintspot.engine.control_loop import ControlLoop
+from faintspot.engine.control.control_loop import ControlLoop
 from faintspot.loop.control.configuration import Control
 from faintspot.loop.control.options import ControlOptions
 from faintspot.loop.simulation import Method, load_loop

@@ -23,8 +23,8 @@ from benchmarks.measuring import Row, Table
 from benchmarks.realtime.realtime_processes import engine_and_telescope
 from faintspot import Calibration, Layout, Settings, SlopePipeline
 from faintspot.engine.engine import Engine
-from faintspot.engine.pixel_ring import PixelRing
-from faintspot.engine.plan import EngineOptions
+from faintspot.engine.frames.pixel_ring import PixelRing
+from faintspot.engine.settings.plan import EngineOptions
 from faintspot.loop.control.base import CONTROLS
 from faintspot.loop.control.configuration import Control, load_control
 from faintspot.loop.control.identification.model import Kalman

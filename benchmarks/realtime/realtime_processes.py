@@ -14,7 +14,7 @@ import numpy as np
 
 import faintspot as fs
 from faintspot.base.errors import InputError
-from faintspot.engine.requests import request, socket_path
+from faintspot.engine.processes.requests import request, socket_path
 from faintspot.slopes.simulate import Detector, sensor_frames
 
 CONFIGURATION = """

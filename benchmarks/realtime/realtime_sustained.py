@@ -34,8 +34,8 @@ from benchmarks.realtime.realtime_processes import (
     resident_bytes,
 )
 from faintspot import Settings
-from faintspot.engine.control_loop import CLOSED
-from faintspot.engine.requests import TELESCOPE, request, socket_path
+from faintspot.engine.control.control_loop import CLOSED
+from faintspot.engine.processes.requests import TELESCOPE, request, socket_path
 from faintspot.loop.simulation import LoopConfiguration, Method, load_loop
 from faintspot.loop.simulation.engine_files import write_engine_files
 from faintspot.slopes.pipeline import configuration as configuration_file

@@ -12,8 +12,8 @@ from tests.patience import LIMIT_S, wait_for
 import faintspot as fs
 from faintspot.base.files import Closing
 from faintspot.engine.engine import Engine
-from faintspot.engine.pixel_ring import PixelRing
-from faintspot.engine.plan import EngineOptions
+from faintspot.engine.frames.pixel_ring import PixelRing
+from faintspot.engine.settings.plan import EngineOptions
 from faintspot.engine.telemetry.ring import TelemetryRing
 from faintspot.slopes.simulate import sensor_frames
 

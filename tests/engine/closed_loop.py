@@ -16,9 +16,9 @@ from tests.loop.simulation.loop_cases import faint
 from tests.patience import wait_for
 
 import faintspot as fs
-from faintspot.engine.control_loop import ControlLoop
+from faintspot.engine.control.control_loop import ControlLoop
 from faintspot.engine.engine import Engine
-from faintspot.engine.segment import FOLDER
+from faintspot.engine.processes.segment import FOLDER
 from faintspot.engine.telemetry.ring import TelemetryRing
 from faintspot.engine.telescope import TRUTH, SimulatedTelescope
 from faintspot.loop.control.base import INTEGRATOR

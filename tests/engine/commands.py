@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 import faintspot
-from faintspot.engine.segment import FOLDER, Segment
+from faintspot.engine.processes.segment import FOLDER, Segment
 
 needs_shared_memory = pytest.mark.skipif(not FOLDER.is_dir(), reason="needs shared memory as Linux has it")
 SOURCE = str(Path(faintspot.__file__).parents[1])

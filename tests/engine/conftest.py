@@ -6,7 +6,7 @@ from uuid import uuid4
 
 import pytest
 
-from faintspot.engine.segment import FOLDER
+from faintspot.engine.processes.segment import FOLDER
 
 try:
     import pyshmem  # starts a process, which tests that are not slow may not do later

@@ -13,9 +13,9 @@ from tests.patience import wait_for
 
 from faintspot.base.errors import InputError
 from faintspot.engine.background import BackgroundLearning, _watch, background_learning
-from faintspot.engine.control_loop import ControlLoop
+from faintspot.engine.control.control_loop import ControlLoop
+from faintspot.engine.processes.requests import ControlServer, socket_path
 from faintspot.engine.request_handlers import commands_of
-from faintspot.engine.requests import ControlServer, socket_path
 from faintspot.engine.telemetry.ring import TelemetryRing
 from faintspot.loop.control.base import ASSUMED, SETTLE_FRAMES, OpenLoopTelemetry
 from faintspot.loop.control.configuration import Control, save_control

@@ -13,7 +13,7 @@ from click.testing import CliRunner, Result
 
 from faintspot.base.errors import InputError
 from faintspot.cli.realtime.learn import calibrate
-from faintspot.engine.poking import StreamedMirror
+from faintspot.engine.control.poking import StreamedMirror
 from faintspot.loop.control import mirror_calibration
 from faintspot.loop.control.configuration import Control, load_control, save_control
 

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from faintspot.base.errors import InputError
+from faintspot.engine.processes.requests import request, socket_path
 from faintspot.engine.request_handlers import commands_of, loop_command
-from faintspot.engine.requests import request, socket_path
 from faintspot.loop.control.configuration import Control
 from faintspot.loop.control.integrator import CompiledIntegrator
 from faintspot.loop.simulation import Method, simulate_loop

@@ -8,8 +8,8 @@ import pytest
 from tests.engine.commands import needs_shared_memory, start
 from tests.patience import LIMIT_S, wait_for
 
-from faintspot.engine.pixel_ring import PixelRing
-from faintspot.engine.segment import FOLDER
+from faintspot.engine.frames.pixel_ring import PixelRing
+from faintspot.engine.processes.segment import FOLDER
 
 pyshmem = pytest.importorskip("pyshmem")
 pytestmark = [needs_shared_memory, pytest.mark.slow]

@@ -7,8 +7,8 @@ import pytest
 from tests.refusals import refused
 
 import faintspot as fs
-from faintspot.engine.interleaving import Interleaving
 from faintspot.engine.request_handlers import commands_of
+from faintspot.engine.settings.interleaving import Interleaving
 from faintspot.loop.control.configuration import Control
 from faintspot.loop.control.kalman.compiled import CompiledKalman
 

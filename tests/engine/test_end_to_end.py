@@ -13,8 +13,8 @@ import pytest
 from tests.patience import LIMIT_S, wait_for
 
 import faintspot as fs
-from faintspot.engine.pixel_ring import PixelRing
-from faintspot.engine.requests import socket_path
+from faintspot.engine.frames.pixel_ring import PixelRing
+from faintspot.engine.processes.requests import socket_path
 
 pyshmem = pytest.importorskip("pyshmem")
 

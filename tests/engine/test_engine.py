@@ -17,10 +17,10 @@ from tests.patience import LIMIT_S
 import faintspot as fs
 from faintspot.cli.realtime import control as realtime_control
 from faintspot.engine.engine import Engine
-from faintspot.engine.readout import Replay
+from faintspot.engine.frames.readout import Replay
+from faintspot.engine.frames.workers import PipelineMaker
 from faintspot.engine.request_handlers import commands_of
 from faintspot.engine.streams.bridge import StreamBridge
-from faintspot.engine.workers import PipelineMaker
 from faintspot.io import open_frames
 from faintspot.slopes.pipeline import configuration
 

@@ -11,8 +11,8 @@ import pytest
 from tests.engine.bench import SETTINGS, Bench, make, simulated
 from tests.engine.commands import start
 
-from faintspot.engine.segment import FOLDER
-from faintspot.engine.timing import CAUSES, INCOMPLETE
+from faintspot.engine.frames.timing import CAUSES, INCOMPLETE
+from faintspot.engine.processes.segment import FOLDER
 
 pyshmem = pytest.importorskip("pyshmem")
 

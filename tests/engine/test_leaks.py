@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from tests.engine.bench import Bench, simulated
 from tests.engine.estimator_files import write
 
-from faintspot.engine.estimators import EstimatorTrial
+from faintspot.engine.settings.estimators import EstimatorTrial
 
 pytestmark = pytest.mark.slow
 
@@ -120,7 +120,7 @@ def test_changes_of_settings(changing: Changing) -> None:
 def test_swaps_of_an_estimator(changing: Changing, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Every one is another version of its file, in use; the trial in another process is left out."""
     # Its frame comes after the change.
-    monkeypatch.setattr("faintspot.engine.estimators.EFFECT_TIMEOUT_S", 0.0)
+    monkeypatch.setattr("faintspot.engine.settings.estimators.EFFECT_TIMEOUT_S", 0.0)
     monkeypatch.setattr(EstimatorTrial, "elsewhere", EstimatorTrial.here)
     estimators, live = changing.bench.engine.estimators, changing.bench.engine.live
     estimators.load(str(write(tmp_path, "return sensor.zero")))

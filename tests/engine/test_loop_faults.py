@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from faintspot.engine.segment import FOLDER
+from faintspot.engine.processes.segment import FOLDER
 from faintspot.engine.streams.shared_streams import _base
 from faintspot.io import read_telemetry
 from faintspot.loop.control.configuration import Control

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import faintspot as fs
-from faintspot.engine.interleaving import Interleaving
+from faintspot.engine.settings.interleaving import Interleaving
 from faintspot.engine.telemetry.recorder import Recorder
 from faintspot.experiments.night.recorded import recorded_night
 from faintspot.experiments.night.recorded_methods import MeasuredStrehl

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 import faintspot as fs
+from faintspot.engine.frames.workers import SlopePrior
 from faintspot.engine.streams.slope_streams import PredictionStream
-from faintspot.engine.workers import SlopePrior
 from faintspot.loop.control.configuration import Control
 from faintspot.loop.simulation import Method, simulate_loop
 from faintspot.loop.simulation.learning import learnt_control

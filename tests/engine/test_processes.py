@@ -6,7 +6,7 @@ import time
 
 import pytest
 
-from faintspot.engine.segment import process_age_s, process_lives, process_start
+from faintspot.engine.processes.segment import process_age_s, process_lives, process_start
 
 pytestmark = pytest.mark.slow
 

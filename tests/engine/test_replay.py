@@ -16,11 +16,11 @@ from tests.refusals import assert_each_refused, refused
 
 from faintspot.cli.realtime import sources as realtime_sources
 from faintspot.cli.realtime.sources import replay
-from faintspot.engine import readout as replay_module
-from faintspot.engine.child_processes import quick_switching
-from faintspot.engine.pixel_ring import PixelRing
-from faintspot.engine.readout import Replay, ring_type
-from faintspot.engine.segment import FOLDER
+from faintspot.engine.frames import readout as replay_module
+from faintspot.engine.frames.pixel_ring import PixelRing
+from faintspot.engine.frames.readout import Replay, ring_type
+from faintspot.engine.processes.child_processes import quick_switching
+from faintspot.engine.processes.segment import FOLDER
 from faintspot.io import FrameSource, open_frames
 
 pytestmark = [needs_shared_memory, pytest.mark.slow]

@@ -7,7 +7,7 @@ import threading
 
 import pytest
 
-from faintspot.engine.child_processes import real_time
+from faintspot.engine.processes.child_processes import real_time
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "sched_setscheduler"), reason="Linux only")
 
@@ -34,7 +34,7 @@ def test_priority_holds_for_threads_that_were_there_before_and_is_given_back() -
 @pytest.mark.slow
 def test_the_lowest_priority() -> None:
     code = (
-        "import os; from faintspot.engine.child_processes import low_priority; low_priority();"
+        "import os; from faintspot.engine.processes.child_processes import low_priority; low_priority();"
         "print(os.sched_getscheduler(0) == os.SCHED_BATCH, os.nice(0))"
     )
     shown = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

@@ -29,9 +29,9 @@ from faintspot.base.errors import InputError
 from faintspot.base.files import Closing
 from faintspot.cli.realtime.control import send
 from faintspot.cli.realtime.control import status as show_status
-from faintspot.engine.pixel_ring import PixelRing
-from faintspot.engine.requests import TELESCOPE, ControlServer, request, socket_path
-from faintspot.engine.segment import FOLDER
+from faintspot.engine.frames.pixel_ring import PixelRing
+from faintspot.engine.processes.requests import TELESCOPE, ControlServer, request, socket_path
+from faintspot.engine.processes.segment import FOLDER
 from faintspot.engine.telescope import (
     TRUTH,
     ObservingConditions,

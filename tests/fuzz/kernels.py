@@ -29,7 +29,7 @@ from tests.refusals import refused_in_one_line
 
 import faintspot as fs
 from faintspot.base.tables import PRESETS
-from faintspot.engine.frame_path import FramePath, Progress
+from faintspot.engine.frames.frame_path import FramePath, Progress
 from faintspot.slopes.estimators import estimators
 from faintspot.slopes.estimators.centroid import brightest_pixels
 from faintspot.slopes.kernels import parallel

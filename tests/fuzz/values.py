@@ -14,7 +14,7 @@ import numpy as np
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays_of
-from tests.engine.test_control_loop import any_control
+from tests.engine.control.test_control_loop import any_control
 from tests.refusals import refused_in_one_line
 from tests.slopes.estimators.test_python import BRIGHT, FAULTS, FRAME, pipeline, raising
 

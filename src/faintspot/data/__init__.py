@@ -19,7 +19,7 @@ def mmt_frame() -> NDArray[np.uint16]:
 
     Notes
     -----
-    Source: `mmirs_wfs_0150.fits` of the test data of mmtwfs (https://github.com/MMTObservatory/mmtwfs),
+    Source: mmirs_wfs_0150.fits of the test data of mmtwfs (https://github.com/MMTObservatory/mmtwfs),
     Copyright (c) 2018, MMT TelescopeModel, BSD-3-Clause; its licence is LICENSE_mmtwfs.rst beside the data.
 
     Examples

@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.errors import InputError
-from faintspot.engine.child_processes import ONE_THREAD, ChildProcesses, low_priority
 from faintspot.engine.engine import Engine
-from faintspot.engine.requests import LENGTHY_TIMEOUT_S, request, socket_path
+from faintspot.engine.processes.child_processes import ONE_THREAD, ChildProcesses, low_priority
+from faintspot.engine.processes.requests import LENGTHY_TIMEOUT_S, request, socket_path
 from faintspot.engine.telemetry.ring import TelemetryRing
 from faintspot.io.telemetry import Telemetry, stored_names
 from faintspot.loop.control.base import KALMAN

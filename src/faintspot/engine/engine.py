@@ -13,17 +13,17 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from faintspot.base.errors import InputError
-from faintspot.engine import plan
-from faintspot.engine.control_loop import CLOSED, OPEN, STATES, ControlLoop
-from faintspot.engine.estimators import EngineEstimators
-from faintspot.engine.frame_path import FramePath
-from faintspot.engine.interleaving import Interleaving
-from faintspot.engine.pixel_ring import PixelRing, living_ring
-from faintspot.engine.running_settings import Change, RunningSettings
+from faintspot.engine.control.control_loop import CLOSED, OPEN, STATES, ControlLoop
+from faintspot.engine.frames.frame_path import FramePath
+from faintspot.engine.frames.pixel_ring import PixelRing, living_ring
+from faintspot.engine.frames.timing import INCOMPLETE, WORKER, FrameAccount
+from faintspot.engine.frames.workers import SlopePrior, Workers
+from faintspot.engine.settings import plan
+from faintspot.engine.settings.estimators import EngineEstimators
+from faintspot.engine.settings.interleaving import Interleaving
+from faintspot.engine.settings.running_settings import Change, RunningSettings
 from faintspot.engine.streams.slope_streams import PredictionStream, SlopeStreams
 from faintspot.engine.telemetry.ring import TelemetryRing
-from faintspot.engine.timing import INCOMPLETE, WORKER, FrameAccount
-from faintspot.engine.workers import SlopePrior, Workers
 from faintspot.loop.control.configuration import Control, packed_control
 from faintspot.loop.control.options import NONE, STREAM
 from faintspot.slopes.pipeline.configuration import to_text

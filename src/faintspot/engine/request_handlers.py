@@ -11,8 +11,8 @@ from numba.core import event
 from faintspot.base.checks import number_between, one_of
 from faintspot.base.errors import InputError
 from faintspot.engine.engine import Engine
-from faintspot.engine.requests import EFFECT_TIMEOUT_S, Handler, changes_of
-from faintspot.engine.workers import PipelineMaker
+from faintspot.engine.frames.workers import PipelineMaker
+from faintspot.engine.processes.requests import EFFECT_TIMEOUT_S, Handler, changes_of
 from faintspot.loop.control.base import KALMAN
 from faintspot.slopes.pipeline.configuration import Configuration
 

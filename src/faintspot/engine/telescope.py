@@ -17,9 +17,9 @@ from faintspot.base.checks import not_none, number_between, numbers_between
 from faintspot.base.errors import InputError
 from faintspot.base.files import Closing
 from faintspot.base.text_files import check_keys
-from faintspot.engine.pixel_ring import PixelRing
-from faintspot.engine.readout import CameraReport, Readout, readout_type
-from faintspot.engine.requests import EFFECT_TIMEOUT_S, Handler, changes_of
+from faintspot.engine.frames.pixel_ring import PixelRing
+from faintspot.engine.frames.readout import CameraReport, Readout, readout_type
+from faintspot.engine.processes.requests import EFFECT_TIMEOUT_S, Handler, changes_of
 from faintspot.engine.streams.bridge import CommandStream
 from faintspot.engine.streams.shared_streams import create_stream, held
 from faintspot.loop.simulation.configuration import LoopConfiguration

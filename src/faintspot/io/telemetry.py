@@ -76,7 +76,7 @@ class Telemetry:
     clock_offset_ns: NDArray[np.int64] = field(metadata=array(np.int64, "frame", "ns"))
     """Offset from these times to Unix time by the wall clock at that moment, which may be reset meanwhile."""
     late: NDArray[np.int64] = field(metadata=array(np.int64, "frame", in_all=False))
-    """Cause of a frame that was late (`faintspot.engine.timing.CAUSES`); 0: in time."""
+    """Cause of a frame that was late (`faintspot.engine.frames.timing.CAUSES`); 0: in time."""
     lost: NDArray[np.int64] = field(metadata=array(np.int64, "frame", in_all=False))
     """Number of frames that the engine lost since the one before."""
     lost_because: NDArray[np.int64] = field(metadata=array(np.int64, "frame", in_all=False))

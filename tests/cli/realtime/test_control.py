@@ -13,8 +13,8 @@ from click.testing import CliRunner
 
 from faintspot.cli.realtime.control import send, status
 from faintspot.cli.realtime.run import run
+from faintspot.engine.processes.requests import ControlServer, socket_path
 from faintspot.engine.request_handlers import commands_of
-from faintspot.engine.requests import ControlServer, socket_path
 from faintspot.loop.control.configuration import Control
 
 pytest.importorskip("pyshmem")

@@ -15,7 +15,7 @@ from tests.loop.control.control_cases import INTERACTION
 from faintspot import Layout, Settings
 from faintspot.base.errors import InputError
 from faintspot.engine import engine
-from faintspot.engine.plan import EngineOptions
+from faintspot.engine.settings.plan import EngineOptions
 from faintspot.loop.control.configuration import save_control
 
 pytestmark = needs_shared_memory

@@ -16,8 +16,8 @@ from tests.engine.commands import start
 from faintspot.base.errors import InputError
 from faintspot.cli.realtime.telescope import in_words, methods_table, write_strehl
 from faintspot.engine.page.demonstration import Shown
-from faintspot.engine.requests import ControlServer, request, socket_path
-from faintspot.engine.segment import FOLDER
+from faintspot.engine.processes.requests import ControlServer, request, socket_path
+from faintspot.engine.processes.segment import FOLDER
 
 
 def test_times_are_those_of_the_middle_of_an_exposure(tmp_path: Path) -> None:

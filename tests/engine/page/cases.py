@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from faintspot.engine.page.client_requests import Access
 from faintspot.engine.page.page_state import Batch, BatchSource, Picture
 from faintspot.engine.page.server import LiveServer
-from faintspot.engine.requests import Handler
+from faintspot.engine.processes.requests import Handler
 from faintspot.engine.telemetry.ring import record_type
 from faintspot.slopes.sensor.layout import Layout
 

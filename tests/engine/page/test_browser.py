@@ -21,8 +21,8 @@ from tests.engine.bench import Bench, simulated
 
 from faintspot.base.checks import number_between
 from faintspot.engine.page.server import LiveServer, serve
+from faintspot.engine.processes.requests import ControlServer, socket_path
 from faintspot.engine.request_handlers import LENGTHY, commands_of
-from faintspot.engine.requests import ControlServer, socket_path
 from faintspot.io.telemetry import read_telemetry
 
 CHROMIUM = next((found for name in ("chromium", "chromium-browser") if (found := shutil.which(name))), None)

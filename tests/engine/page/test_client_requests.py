@@ -12,7 +12,7 @@ from tests.engine.telemetry_cases import LAYOUT, Engine
 
 from faintspot.base.errors import InputError
 from faintspot.engine.page.client_requests import EngineRequests, answered
-from faintspot.engine.requests import ControlServer, socket_path
+from faintspot.engine.processes.requests import ControlServer, socket_path
 from faintspot.engine.telemetry.ring import TelemetryRing
 from faintspot.io.telemetry import read_telemetry
 

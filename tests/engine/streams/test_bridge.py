@@ -14,7 +14,7 @@ from tests.engine.commands import needs_shared_memory
 from tests.patience import wait_for
 
 from faintspot.base.errors import InputError
-from faintspot.engine.pixel_ring import PixelRing
+from faintspot.engine.frames.pixel_ring import PixelRing
 from faintspot.engine.streams import bridge as bridge_module
 from faintspot.engine.streams.bridge import BridgeCounters, StreamBridge
 

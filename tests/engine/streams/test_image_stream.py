@@ -14,8 +14,8 @@ from tests.engine.image_files import IsioFile
 from tests.patience import LIMIT_S, wait_for
 
 from faintspot.base.errors import InputError
-from faintspot.engine.pixel_ring import PixelRing
-from faintspot.engine.segment import FOLDER
+from faintspot.engine.frames.pixel_ring import PixelRing
+from faintspot.engine.processes.segment import FOLDER
 from faintspot.engine.streams.bridge import StreamBridge, StreamOut
 from faintspot.engine.streams.image_layout import IncompatibleStreamError
 from faintspot.engine.streams.image_stream import ImageStream, ImageStreamWriter

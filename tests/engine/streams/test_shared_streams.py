@@ -19,7 +19,7 @@ import pytest
 from tests.engine.commands import start
 
 from faintspot.base.errors import InputError
-from faintspot.engine.segment import FOLDER
+from faintspot.engine.processes.segment import FOLDER
 from faintspot.engine.streams import shared_streams
 from faintspot.engine.streams.shared_streams import create_stream, lock_file, pyshmem_module
 from faintspot.engine.streams.slope_streams import SlopeStreams

@@ -12,8 +12,8 @@ from tests.engine.telemetry_cases import LAYOUT, SETTINGS, N, as_written, slopes
 from tests.patience import LIMIT_S
 
 from faintspot.base.errors import InputError
-from faintspot.engine.pixel_ring import PixelRing
-from faintspot.engine.segment import FOLDER
+from faintspot.engine.frames.pixel_ring import PixelRing
+from faintspot.engine.processes.segment import FOLDER
 from faintspot.engine.telemetry.ring import TelemetryRing
 from faintspot.slopes.sensor.layout import Layout
 

@@ -10,7 +10,7 @@ from tests.refusals import refused
 
 import faintspot as fs
 from faintspot.base.flags import SubapertureFlag
-from faintspot.engine.control_loop import ControlLoop
+from faintspot.engine.control.control_loop import ControlLoop
 from faintspot.loop.control.configuration import Control, load_control, save_control
 from faintspot.loop.control.integrator import MEAN_SQUARE
 from faintspot.loop.control.options import ControlOptions

@@ -6,7 +6,7 @@ from tests.refusals import refused
 
 from faintspot import PSF, Calibration, Layout, Settings, SlopePipeline
 from faintspot.base.flags import SubapertureFlag
-from faintspot.engine.workers import PipelineMaker
+from faintspot.engine.frames.workers import PipelineMaker
 from faintspot.slopes.sensor.binning import binned_layout, magnified_layout
 
 LAYOUT = Layout.grid((2, 3), pixels=24, bin=2, frame_shape=(49, 73), pixel_scale_arcsec=0.1)

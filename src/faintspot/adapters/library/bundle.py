@@ -18,10 +18,10 @@ from numpy.typing import NDArray
 from faintspot.adapters.library.objects import argument_types
 from faintspot.base import __version__
 from faintspot.base.errors import InputError
-from faintspot.engine.frame_path import check_real_time, last_rows_of_groups
+from faintspot.engine.frames.frame_path import check_real_time, last_rows_of_groups
 from faintspot.slopes.kernels.compiling import types
-from faintspot.slopes.kernels.doubtful import check_slopes
 from faintspot.slopes.kernels.groups import ERROR_SCALE, SlopeArrays
+from faintspot.slopes.kernels.validity.doubtful import check_slopes
 from faintspot.slopes.pipeline.slope_pipeline import SlopePipeline
 
 FORMAT = 1

@@ -19,7 +19,7 @@ from faintspot.cli.realtime.engine_requests import (
     stop_on_signal,
     summary,
 )
-from faintspot.engine.requests import ENGINE, TELESCOPE, since
+from faintspot.engine.processes.requests import ENGINE, TELESCOPE, since
 
 if TYPE_CHECKING:
     from faintspot.engine.telemetry.recorder import RecordingReport

@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from faintspot.engine.requests import ENGINE, LENGTHY_TIMEOUT_S, request, socket_path
+from faintspot.engine.processes.requests import ENGINE, LENGTHY_TIMEOUT_S, request, socket_path
 
 if TYPE_CHECKING:
-    from faintspot.engine.readout import CameraReport
+    from faintspot.engine.frames.readout import CameraReport
 
 
 PATIENCE_S = 2.0
@@ -23,7 +23,7 @@ PATIENCE_S = 2.0
 
 
 def asked(name: str, command: str, kind: str = ENGINE, /, **fields: Any) -> dict[str, Any]:
-    """Ask the engine or telescope of that name; see `faintspot.engine.requests.request`."""
+    """Ask the engine or telescope of that name; see `faintspot.engine.processes.requests.request`."""
     return request(socket_path(name, kind), command, **fields)
 
 

@@ -117,7 +117,7 @@ def calibrate(
     """
     import numpy as np
 
-    from faintspot.engine.poking import StreamedMirror
+    from faintspot.engine.control.poking import StreamedMirror
     from faintspot.loop.control.configuration import load_control
     from faintspot.loop.control.mirror_calibration import (
         calibrate_mirror,
@@ -161,7 +161,7 @@ def calibrate(
 
 def _known_commands(former: Any, name: str) -> int:
     """Return the number of commands of the former calibration, or of a simulated telescope."""
-    from faintspot.engine.requests import TELESCOPE, request, socket_path
+    from faintspot.engine.processes.requests import TELESCOPE, request, socket_path
 
     if former is not None:
         return int(former.commands)

@@ -26,7 +26,7 @@ from faintspot.cli.commands import (
     option,
 )
 from faintspot.cli.realtime.engine_requests import stop_on_signal, summary
-from faintspot.engine.requests import socket_path
+from faintspot.engine.processes.requests import socket_path
 
 if TYPE_CHECKING:
     from faintspot.engine.engine import Engine
@@ -64,8 +64,8 @@ def live(name: str, bind: str, port: int, private: bool, folder: Path) -> None:
       faintspot live
       faintspot live --port 8700
     """
-    from faintspot.engine.child_processes import low_priority
     from faintspot.engine.page.server import serve
+    from faintspot.engine.processes.child_processes import low_priority
 
     require_linux("live")
     low_priority(_NICENESS)
@@ -170,13 +170,13 @@ def run(
       faintspot realtime run --close-loop --interleave integrator,kalman --every 250
     """
     from faintspot.base.errors import InputError
-    from faintspot.engine.child_processes import real_time
     from faintspot.engine.engine import Engine
-    from faintspot.engine.interleaving import Interleaving
-    from faintspot.engine.plan import EngineOptions
+    from faintspot.engine.frames.workers import PipelineMaker
+    from faintspot.engine.processes.child_processes import real_time
+    from faintspot.engine.processes.requests import ControlServer
     from faintspot.engine.request_handlers import LENGTHY, commands_of, while_starting
-    from faintspot.engine.requests import ControlServer
-    from faintspot.engine.workers import PipelineMaker
+    from faintspot.engine.settings.interleaving import Interleaving
+    from faintspot.engine.settings.plan import EngineOptions
     from faintspot.loop.control.configuration import load_control
     from faintspot.slopes.pipeline.configuration import Configuration
 

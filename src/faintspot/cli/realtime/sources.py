@@ -66,9 +66,9 @@ def replay(
       faintspot realtime replay night1.fits night2.fits.gz --frame-rate-hz 300
       faintspot realtime replay cube.npy --frame-rate-hz 1000 --rows-per-block 4 --frames 1000 --repeat
     """
-    from faintspot.engine.child_processes import quick_switching
-    from faintspot.engine.pixel_ring import PixelRing
-    from faintspot.engine.readout import Replay, ring_type
+    from faintspot.engine.frames.pixel_ring import PixelRing
+    from faintspot.engine.frames.readout import Replay, ring_type
+    from faintspot.engine.processes.child_processes import quick_switching
     from faintspot.io import open_frames
 
     repeat = options["repeat"]
@@ -132,7 +132,7 @@ def bridge(
         raise InputError("bridge: expected a stream of frames, --to or --commands-to, got none")
     if frames is not None and not stream:
         raise InputError("--frames: expected a stream of frames, got none")
-    from faintspot.engine.child_processes import quick_switching
+    from faintspot.engine.processes.child_processes import quick_switching
     from faintspot.engine.streams.bridge import StreamBridge, StreamOut
 
     def say(line: str) -> None:

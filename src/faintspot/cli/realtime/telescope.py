@@ -16,7 +16,7 @@ from faintspot.base.files import output_errors
 from faintspot.cli.commands import FRAMES, PORT, READOUT_FRACTION, name_option, needs, option
 from faintspot.cli.output import results_table
 from faintspot.cli.realtime.engine_requests import published, stop_on_signal
-from faintspot.engine.requests import TELESCOPE, socket_path
+from faintspot.engine.processes.requests import TELESCOPE, socket_path
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -96,8 +96,8 @@ def telescope(
       faintspot realtime run --config bench/faintspot.toml
       faintspot realtime send --telescope photons=50 seeing_arcsec=1.2
     """
-    from faintspot.engine.child_processes import real_time
-    from faintspot.engine.requests import ControlServer
+    from faintspot.engine.processes.child_processes import real_time
+    from faintspot.engine.processes.requests import ControlServer
     from faintspot.engine.telescope import LENGTHY, SimulatedTelescope, commands_of
     from faintspot.loop.simulation.configuration import load_loop
     from faintspot.loop.simulation.engine_files import write_engine_files

@@ -12,7 +12,7 @@ from typing import Any
 
 from faintspot.base.errors import InputError
 from faintspot.base.tables import parse_changes, parse_ranges
-from faintspot.engine.requests import LENGTHY_TIMEOUT_S, Handler, request, since, socket_path
+from faintspot.engine.processes.requests import LENGTHY_TIMEOUT_S, Handler, request, since, socket_path
 from faintspot.engine.telemetry.recorder import Recorder
 from faintspot.slopes.estimators.registry import one_line
 

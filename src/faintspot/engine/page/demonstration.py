@@ -15,11 +15,11 @@ import numpy as np
 from faintspot.base.arrays import Floats
 from faintspot.base.errors import InputError
 from faintspot.base.files import Closing, derived, output_errors, write_atomically
-from faintspot.engine.child_processes import ONE_THREAD, ChildProcesses
-from faintspot.engine.control_loop import CLOSED, STATES
-from faintspot.engine.interleaving import short_names
+from faintspot.engine.control.control_loop import CLOSED, STATES
+from faintspot.engine.processes.child_processes import ONE_THREAD, ChildProcesses
+from faintspot.engine.processes.requests import TELESCOPE, ControlServer, request, socket_path
 from faintspot.engine.request_handlers import while_starting
-from faintspot.engine.requests import TELESCOPE, ControlServer, request, socket_path
+from faintspot.engine.settings.interleaving import short_names
 from faintspot.engine.streams.stream import Follower
 from faintspot.engine.telemetry.numbers import MethodDifference, compared_methods
 from faintspot.engine.telemetry.ring import TelemetryRing

@@ -14,7 +14,7 @@ from faintspot.base.checks import not_none
 from faintspot.base.errors import InputError
 from faintspot.base.text_files import to_json
 from faintspot.engine.page.page_state import BatchSource, PageState, Picture, flag_names
-from faintspot.engine.requests import request, socket_path
+from faintspot.engine.processes.requests import request, socket_path
 from faintspot.slopes.estimators.registry import allowed_in_words, estimators
 from faintspot.slopes.pipeline.settings import SharedOptions
 from faintspot.slopes.sensor.layout import Layout

@@ -22,7 +22,7 @@ from faintspot.engine.page.client_requests import Access, EngineRequests, answer
 from faintspot.engine.page.engine_source import EngineSource
 from faintspot.engine.page.page import UPDATE_S, LatestMessages, Page, StatusPoller, packed
 from faintspot.engine.page.page_state import BatchSource
-from faintspot.engine.requests import Handler
+from faintspot.engine.processes.requests import Handler
 
 try:
     from tornado.httpserver import HTTPServer

@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 
 from faintspot.base.checks import not_none, number_between
 from faintspot.base.errors import InputError
-from faintspot.engine.pixel_ring import PixelRing
-from faintspot.engine.readout import ring_type
+from faintspot.engine.frames.pixel_ring import PixelRing
+from faintspot.engine.frames.readout import ring_type
 from faintspot.engine.streams.image_stream import ImageStreamWriter, Publication
 from faintspot.engine.streams.stream import Follower, Stream, StreamCounters, image_name
 

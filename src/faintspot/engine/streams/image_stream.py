@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.errors import InputError
-from faintspot.engine.segment import identity_of, new_memory, process_start
+from faintspot.engine.processes.segment import identity_of, new_memory, process_start
 from faintspot.engine.streams import image_layout as layout
 from faintspot.slopes.kernels.ordered import fence, load, store
 

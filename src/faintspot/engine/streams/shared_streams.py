@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import DTypeLike
 
 from faintspot.base.errors import InputError, MissingExtraError
-from faintspot.engine.segment import FOLDER, new_memory, process_age_s
+from faintspot.engine.processes.segment import FOLDER, new_memory, process_age_s
 
 LOCK_LIMIT_S = 1.0
 _LOOK_S = 0.01

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from faintspot.base.errors import InputError
+from faintspot.engine.frames.workers import SlopePrior
 from faintspot.engine.streams.shared_streams import (
     LOCK_LIMIT_S,
     create_stream,
@@ -19,7 +20,6 @@ from faintspot.engine.streams.shared_streams import (
     pyshmem_module,
 )
 from faintspot.engine.streams.stream import Follower
-from faintspot.engine.workers import SlopePrior
 from faintspot.slopes.kernels.compiling import Direct
 from faintspot.slopes.kernels.products import fill_telemetry_rows
 from faintspot.slopes.pipeline.slopes import RESULT_TYPES, Slopes

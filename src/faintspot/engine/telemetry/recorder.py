@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from faintspot.base.checks import number_between
 from faintspot.base.errors import InputError, load_package
 from faintspot.base.files import output_errors
-from faintspot.engine.interleaving import methods_after
+from faintspot.engine.settings.interleaving import methods_after
 from faintspot.engine.telemetry.ring import Ring, TelemetryRing
 from faintspot.io.telemetry import ARRAYS, CONTROL, FRAMES, IMAGES, stored_names
 from faintspot.io.zarr_store import TELEMETRY, checked_codecs, new_store, replace_attributes

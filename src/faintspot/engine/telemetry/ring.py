@@ -4,7 +4,7 @@ The engine's thread writes; any number of processes of the same user read. The w
 that is too slow loses the oldest records and gets their number. One segment, NAME_telemetry, holds three
 rings: a record for every frame, pixel images of some frames, and changes of settings.
 
-Item k of a ring is in place k % length (see `engine.segment`). An item is written first and counted
+Item k of a ring is in place k % length (see `engine.processes.segment`). An item is written first and counted
 afterwards (`kernels.ordered`). The next item overwrites the oldest, which a reader already counts
 as lost.
 """
@@ -22,7 +22,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from faintspot.base.checks import number_between
 from faintspot.base.text_files import parse_json, plain_values, to_json
-from faintspot.engine.segment import CLOSED, Segment
+from faintspot.engine.processes.segment import CLOSED, Segment
 from faintspot.io.telemetry import item_type
 from faintspot.slopes.kernels.ordered import fence, load, store
 from faintspot.slopes.pipeline.slopes import Slopes

@@ -9,11 +9,11 @@ from faintspot.base.checks import image_stack, number_between, numbers_between, 
 from faintspot.base.errors import InputError
 from faintspot.base.statistics import MAD_TO_STD
 from faintspot.base.tables import PRESETS, of_denoising
-from faintspot.slopes.kernels.denoise import CHAMBOLLE, FGP
-from faintspot.slopes.kernels.flat_start import flat_start_table
-from faintspot.slopes.kernels.gravity import denoise_stack
 from faintspot.slopes.kernels.host import lanes_for
 from faintspot.slopes.kernels.parallel import run_groups
+from faintspot.slopes.kernels.positions.gravity import denoise_stack
+from faintspot.slopes.kernels.total_variation.denoise import CHAMBOLLE, FGP
+from faintspot.slopes.kernels.total_variation.flat_start import flat_start_table
 
 
 def suggested_strength(

@@ -13,8 +13,9 @@ from faintspot.slopes.estimators.base import Estimator, EstimatorPlan, Positions
 from faintspot.slopes.estimators.built_in.gravity import keep_all
 from faintspot.slopes.estimators.registry import faults_of
 from faintspot.slopes.estimators.sensor import Sensor
-from faintspot.slopes.kernels import gravity, groups
+from faintspot.slopes.kernels import groups
 from faintspot.slopes.kernels.groups import SlopeArrays
+from faintspot.slopes.kernels.positions import gravity
 
 _NO_FLUX = np.uint8(SubapertureFlag.NO_FLUX)
 _TYPICAL_FLUX_E = 300.0

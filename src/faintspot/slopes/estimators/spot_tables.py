@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.arrays import Floats
-from faintspot.slopes.kernels.brightest import SMALLEST_VARIANCE
-from faintspot.slopes.kernels.spot_rows import MARGIN, PHASES
+from faintspot.slopes.kernels.positions.brightest import SMALLEST_VARIANCE
+from faintspot.slopes.kernels.positions.spot_rows import MARGIN, PHASES
 from faintspot.slopes.spots.psf import PSF
 from faintspot.slopes.spots.shapes import FWHM_TO_STD
 
@@ -31,7 +31,7 @@ class SpotModel:
     """Profiles of the spots, or of weights centred on them, as the kernels read them."""
 
     tables: NDArray[np.float32]
-    """(n_models, 2, rank, 2, PHASES, length), see `faintspot.slopes.kernels.spot_rows.look_up`."""
+    """(n_models, 2, rank, 2, PHASES, length), see `faintspot.slopes.kernels.positions.spot_rows.look_up`."""
     index: NDArray[np.int64]
     """Model of each sub-aperture."""
     fwhm_px: Floats
@@ -249,7 +249,7 @@ def posterior_tables(
     """Compute log-likelihoods on a `posterior_grid` for triples of PSF, flux and variances of dark pixels.
 
     Those are (n, ny, nx), or (n, 1, 1) where they are the same in all pixels. Returns `logarithms` and
-    `constants` of `kernels.fits.PosteriorTables`.
+    `constants` of `PosteriorTables`.
     """
     nx = window[1]
     variance = np.maximum(variance, SMALLEST_VARIANCE)

@@ -7,8 +7,8 @@ from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 from typing import Any
 
-from faintspot.slopes.kernels.gravity import gravity_scratch
 from faintspot.slopes.kernels.groups import Scratch, new_scratch
+from faintspot.slopes.kernels.positions.gravity import gravity_scratch
 from faintspot.slopes.kernels.simd import Lanes
 
 _FEWEST_US = 50.0  # of work for a thread: waking one takes about 30 us

@@ -14,7 +14,7 @@ from faintspot.base.flags import UNMEASURED, SubapertureFlag, scaled_positions
 from faintspot.base.statistics import MAD_TO_STD
 from faintspot.slopes.camera.calibration import Calibration, binned
 from faintspot.slopes.estimators.base import Estimator
-from faintspot.slopes.kernels.doubtful import doubtful_scratch_size, flag_doubtful
+from faintspot.slopes.kernels.validity.doubtful import doubtful_scratch_size, flag_doubtful
 from faintspot.slopes.pipeline.light import MeanLight
 from faintspot.slopes.pipeline.settings import Settings
 from faintspot.slopes.pipeline.slope_pipeline import SlopePipeline

@@ -12,8 +12,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from faintspot.base.checks import not_none, number_between, numbers_between, real_array
 from faintspot.base.errors import InputError
-from faintspot.slopes.kernels.dark import MOST_LANES, LightTest, scratch_size, significances
 from faintspot.slopes.kernels.host import WIDTHS, lanes_for
+from faintspot.slopes.kernels.validity.dark import MOST_LANES, LightTest, scratch_size, significances
 from faintspot.slopes.sensor.layout import Layout
 
 FALSE_LIGHT = 1e-3

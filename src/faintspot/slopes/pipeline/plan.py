@@ -15,10 +15,10 @@ from faintspot.slopes.estimators.base import Estimator, EstimatorPlan
 from faintspot.slopes.estimators.sensor import Sensor
 from faintspot.slopes.kernels import groups
 from faintspot.slopes.kernels.compiling import Direct
-from faintspot.slopes.kernels.dark import LightTest
-from faintspot.slopes.kernels.doubtful import Expected
 from faintspot.slopes.kernels.groups import Scratch, SlopeArrays, Source, Task
 from faintspot.slopes.kernels.host import lanes_for
+from faintspot.slopes.kernels.validity.dark import LightTest
+from faintspot.slopes.kernels.validity.doubtful import Expected
 from faintspot.slopes.pipeline.settings import Settings, spot_fwhm_px
 from faintspot.slopes.pipeline.slopes import Slopes
 from faintspot.slopes.sensor.layout import Layout

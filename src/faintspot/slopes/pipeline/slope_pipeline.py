@@ -21,8 +21,6 @@ from faintspot.base.flags import scaled_positions
 from faintspot.slopes.camera.calibration import Calibration, binned, binned_calibration, spread
 from faintspot.slopes.estimators.base import Estimator
 from faintspot.slopes.kernels.compiling import Direct
-from faintspot.slopes.kernels.dark import scratch_size
-from faintspot.slopes.kernels.doubtful import check_slopes, doubtful_scratch_size
 from faintspot.slopes.kernels.groups import (
     CALIBRATED,
     STAGE_ROWS,
@@ -35,6 +33,8 @@ from faintspot.slopes.kernels.groups import (
 from faintspot.slopes.kernels.host import lanes_for
 from faintspot.slopes.kernels.parallel import most_threads, run_groups, thread_scratch
 from faintspot.slopes.kernels.simd import Lanes
+from faintspot.slopes.kernels.validity.dark import scratch_size
+from faintspot.slopes.kernels.validity.doubtful import check_slopes, doubtful_scratch_size
 from faintspot.slopes.pipeline import configuration
 from faintspot.slopes.pipeline.light import MeanFlux, MeanLight, light_test
 from faintspot.slopes.pipeline.plan import (

@@ -11,8 +11,8 @@ from numpy.typing import ArrayLike, NDArray
 from faintspot.base.checks import number_between
 from faintspot.base.errors import InputError
 from faintspot.base.statistics import MAD_TO_STD
-from faintspot.slopes.kernels.doubtful import Expected, doubtful_scratch_size, flag_doubtful
 from faintspot.slopes.kernels.host import lanes_for
+from faintspot.slopes.kernels.validity.doubtful import Expected, doubtful_scratch_size, flag_doubtful
 from faintspot.slopes.sensor.binning import magnified_layout, scaled_points
 from faintspot.slopes.sensor.detection.lenslets import LensletGrid
 from faintspot.slopes.sensor.layout import Layout

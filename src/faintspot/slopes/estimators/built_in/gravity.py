@@ -27,8 +27,8 @@ from faintspot.slopes.estimators.base import (
 from faintspot.slopes.estimators.centroid import RULES, most_kept, threshold_rank
 from faintspot.slopes.estimators.registry import register
 from faintspot.slopes.estimators.sensor import PIXEL_BLUR_PX2, Scene, Sensor
-from faintspot.slopes.kernels import gravity
 from faintspot.slopes.kernels.groups import RANGE
+from faintspot.slopes.kernels.positions import gravity
 
 KEPT_FRACTION = 0.08  # of a window's pixels, if keep_brightest is not given: 20 of 16 x 16
 FEWEST_KEPT = 5

@@ -23,8 +23,8 @@ from faintspot.slopes.estimators.built_in.weighted import SpotPlan, Stepping
 from faintspot.slopes.estimators.registry import register
 from faintspot.slopes.estimators.sensor import Scene, Sensor
 from faintspot.slopes.estimators.spot_tables import SpotModel, model_of_psf
-from faintspot.slopes.kernels import fits as spot_fits
 from faintspot.slopes.kernels.groups import RANGE, flux_above_edges
+from faintspot.slopes.kernels.positions import fits as spot_fits
 from faintspot.slopes.spots.psf import PSF
 
 _BLURS = (0.4, 0.0, 0.8, 1.2)  # of the PSF of a speckled spot, in units of lambda / d

@@ -21,8 +21,8 @@ from faintspot.slopes.estimators.built_in.gravity import GravityPlan, KeepingBri
 from faintspot.slopes.estimators.noise import ALGORITHMS, suggested_strength, tv_denoise
 from faintspot.slopes.estimators.registry import register
 from faintspot.slopes.estimators.sensor import Scene, Sensor
-from faintspot.slopes.kernels import gravity
-from faintspot.slopes.kernels.flat_start import flat_start_table
+from faintspot.slopes.kernels.positions import gravity
+from faintspot.slopes.kernels.total_variation.flat_start import flat_start_table
 
 _STRENGTHS = (1.0, 0.4, 0.6, 0.8, 1.25)  # multiples of the automatic strength
 _LEAST_STRENGTH_E = 1e-3

@@ -18,9 +18,9 @@ from faintspot.slopes.estimators.base import Estimator, EstimatorPlan, Need, Sty
 from faintspot.slopes.estimators.registry import register
 from faintspot.slopes.estimators.sensor import Scene
 from faintspot.slopes.estimators.spot_tables import SpotModel
-from faintspot.slopes.kernels import fits as spot_fits
-from faintspot.slopes.kernels.brightest import SMALLEST_VARIANCE
 from faintspot.slopes.kernels.groups import RANGE
+from faintspot.slopes.kernels.positions import fits as spot_fits
+from faintspot.slopes.kernels.positions.brightest import SMALLEST_VARIANCE
 
 _STEPS_IN_BRIGHT_FLUX = 12
 

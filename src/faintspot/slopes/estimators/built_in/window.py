@@ -19,9 +19,9 @@ from faintspot.slopes.estimators.base import Estimator, EstimatorPlan, Need, Sty
 from faintspot.slopes.estimators.registry import register
 from faintspot.slopes.estimators.sensor import Scene, Sensor
 from faintspot.slopes.estimators.spot_tables import gaussian_psf
-from faintspot.slopes.kernels import window
 from faintspot.slopes.kernels.groups import RANGE
 from faintspot.slopes.kernels.host import WIDTHS, lanes_for
+from faintspot.slopes.kernels.positions import window
 from faintspot.slopes.spots.fixed_weights import FixedWeights
 from faintspot.slopes.spots.shapes import FWHM_TO_STD
 

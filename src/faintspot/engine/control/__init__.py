@@ -1,0 +1,1 @@
+"""From slopes to commands: `control_loop`, its `guard`, and `poking` of the mirror for its calibration."""

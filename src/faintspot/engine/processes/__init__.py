@@ -1,0 +1,1 @@
+"""Child processes, shared memory, and requests to a running engine."""

@@ -1,0 +1,1 @@
+"""Denoising by constrained total variation: `sweeps` (an iteration), `flat_start`, `denoise`."""

@@ -1,0 +1,1 @@
+"""Which slopes are valid."""
