@@ -29,17 +29,6 @@ pyshmem = pytest.importorskip("pyshmem")
 pytestmark = pytest.mark.slow
 
 
-def test_every_frame_is_published_once_and_bit_for_bit(bench: Bench) -> None:
-    data = simulated(6)
-    expected = make(SETTINGS)(data).vector
-    bench.measure(data)
-    assert all(np.array_equal(bench.slopes[number], expected[number]) for number in range(6))
-    counters = bench.engine.counters
-    assert (counters.processed, counters.dropped, counters.skipped) == (6, 0, 0)
-    assert counters.iterations == make(SETTINGS)(data).iterations.sum()
-    assert bench.engine.account.latencies.as_dict()["count"] == 6
-
-
 def test_what_is_published(bench: Bench) -> None:
     """Slopes, details and marks, stamped with the frame's number."""
     data = simulated(1)

@@ -11,54 +11,11 @@ import pytest
 from tests.engine.bench import SETTINGS, Bench, make, simulated
 from tests.engine.commands import start
 
-from faintspot.engine.frames.timing import CAUSES, INCOMPLETE
 from faintspot.engine.processes.segment import FOLDER
 
 pyshmem = pytest.importorskip("pyshmem")
 
 pytestmark = pytest.mark.slow
-
-
-def test_a_short_frame(bench: Bench) -> None:
-    """The next frame begins before the last row was there: it is not measured, and the next one is."""
-    data = simulated(3)
-    with bench.ring() as ring:
-        bench.attached()
-        bench.send(ring, 0, data[0])
-        ring.begin(1)[:5] = data[1][:5]
-        ring.rows_ready(5)
-        bench.send(ring, 2, data[2])
-        bench.until(lambda: bench.engine.counters.processed == 2)
-    counters = bench.engine.counters
-    assert (counters.short, counters.dropped, counters.skipped) == (1, 1, 0)
-    assert bench.engine.account.lost_because == {CAUSES[INCOMPLETE]: 1}
-    assert bench.records["lost"].sum() == 1
-    assert bench.records["frame"].tolist() == [0, 2]
-    assert np.array_equal(bench.slopes[2], make(SETTINGS)(data[2]).vector)
-
-
-@pytest.mark.parametrize(
-    ("numbers", "skipped", "repeated"),
-    [
-        ([7, 7, 7, 7], 0, 3),
-        ([5, 1006], 1000, 0),
-        ([10, 12, 0, 1], 1, 1),
-        ([5, 2**62, 0, 1], 0, 1),
-        ([5, 2**63 - 1, 0, 1], 0, 1),
-    ],
-)
-def test_repeated_and_skipped_numbers_are_counted(
-    bench: Bench, numbers: list[int], skipped: int, repeated: int
-) -> None:
-    """No frame that came is lost where numbers stay, are left out, begin anew or jump."""
-    data = simulated(len(numbers))
-    bench.measure(data, numbers)
-    counters = bench.engine.counters
-    assert (counters.processed, counters.dropped, counters.torn) == (len(numbers), 0, 0)
-    assert (counters.skipped, counters.repeated) == (skipped, repeated)
-    assert counters.source_restarts == (max(numbers) >= 2**62)
-    assert bench.records["frame"].tolist() == numbers
-    assert np.array_equal(bench.records["x"], make(SETTINGS)(data).x)
 
 
 def test_overtaken_frames_are_dropped_never_mixed(bench: Bench) -> None:

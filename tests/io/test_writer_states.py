@@ -104,6 +104,7 @@ class SlopeFiles(RuleBasedStateMachine):
             shutil.rmtree(self.folder)
 
 
+@pytest.mark.hypothesis
 @pytest.mark.parametrize("mark_s", [0.0, 1e9], ids=["marks at once", "marks at the end"])
 def test_slope_files_are_what_was_appended(monkeypatch: pytest.MonkeyPatch, mark_s: float) -> None:
     monkeypatch.setattr(zarr_files, "_CHUNK_NUMBERS", 70)

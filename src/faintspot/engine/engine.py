@@ -321,6 +321,7 @@ class Engine:
         if not moment:
             self._lose(ring, path, arrival, number)
             return
+        path.locate()
         self._streams.publish_slopes(slopes, number)
         published = time.monotonic_ns()
         loop, state, commands = self.loop, 0, None

@@ -62,6 +62,7 @@ class Source:
         self.slots[0] = frame
         self.cells[0] += 1
         assert self.path.measure(int(self.cells[0]), 0)
+        self.path.locate()
         return self.path.slopes
 
 

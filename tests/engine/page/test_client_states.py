@@ -193,6 +193,7 @@ class Clients(RuleBasedStateMachine):
         self.loop.close()
 
 
+@pytest.mark.hypothesis
 def test_clients_get_the_newest_messages_and_change_with_the_token_alone(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

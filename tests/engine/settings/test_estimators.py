@@ -81,35 +81,6 @@ def mine(path: Path, **options: Any) -> fs.Settings:
     return SETTINGS.replace(estimator=kind(**options))
 
 
-def test_load_set_swap_unload(camera: Camera, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    path = write(tmp_path)
-    assert camera.ask["load"]({"source": str(path)}) == {"estimators": ["mine"], "frame": None}
-    assert camera.engine.status()["loaded"] == {"mine": str(path)}
-    monkeypatch.setattr(EstimatorTrial, "elsewhere", EstimatorTrial.here)  # another process was begun once
-    camera.assert_measured_with(SETTINGS, camera.shoot())
-
-    camera.change(estimator="mine", share=0.5)
-    camera.assert_measured_with(mine(path, share=0.5), camera.shoot())
-
-    with pytest.raises(fs.InputError, match="--replace"):
-        camera.ask["load"]({"source": str(path)})
-    write(tmp_path, PEAK.replace("self.share", "0.5 * self.share"))
-    camera.ask["load"]({"source": str(path), "replace": True})  # options stay
-    camera.shoot(n=2)
-    camera.assert_measured_with(mine(path, share=0.5), camera.shoot())
-
-    camera.ask["unload"]({"estimator": "mine"})
-    camera.shoot(n=2)
-    camera.assert_measured_with(SETTINGS, camera.shoot())
-    with pytest.raises(fs.InputError, match="estimator = 'mine'"):
-        camera.engine.live.propose({"estimator": "mine"})
-    with pytest.raises(fs.InputError, match="loaded"):
-        camera.ask["unload"]({"estimator": "mine"})
-    counters = camera.engine.counters
-    assert counters.processed == counters.frames_in == camera.sent
-    assert counters.estimator_failures == counters.dropped == 0
-
-
 @pytest.mark.usefixtures("tried_here")
 def test_a_compiled_estimator(camera: Camera, tmp_path: Path) -> None:
     path = tmp_path / "compiled.py"
@@ -128,20 +99,6 @@ def test_a_compiled_estimator(camera: Camera, tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("tried_here")
-def test_a_frame_that_fails_is_flagged_and_counted(camera: Camera, tmp_path: Path) -> None:
-    camera.ask["load"]({"source": str(write(tmp_path, FAILING.format("raise ValueError('bright')")))})
-    camera.change(estimator="mine")
-    bad = camera.shoot(camera.bright)
-    good = camera.shoot()
-    assert camera.engine.counters.estimator_failures == 1
-    records = {int(each["frame"]): each for each in camera.records}
-    assert np.all(records[bad]["flags"] & 1)
-    assert np.all(camera.slopes[bad] == 0)
-    assert np.all(camera.slopes[good] == 0.25)
-    assert camera.engine.status()["estimator_fault"] is None
-
-
-@pytest.mark.usefixtures("tried_here")
 @pytest.mark.parametrize("fault", ["raise RuntimeError('out of order')", "time.sleep(60)"])
 def test_one_that_goes_on_failing_is_given_up(camera: Camera, tmp_path: Path, fault: str) -> None:
     """The built-in estimator before takes over with the next frame, with the settings as they are now."""
@@ -156,18 +113,6 @@ def test_one_that_goes_on_failing_is_given_up(camera: Camera, tmp_path: Path, fa
     assert camera.engine.counters.processed == camera.sent
     taken = camera.engine.live.taken()[-1][2]
     assert (taken["estimator"], taken["estimator_fault"]) == ("tv", status["estimator_fault"])
-
-
-@pytest.mark.usefixtures("tried_here")
-def test_a_fault_in_an_method_ends_taking_turns(camera: Camera, tmp_path: Path) -> None:
-    camera.ask["load"]({"source": str(write(tmp_path, FAILING.format("raise ValueError")))})
-    camera.engine.interleave("set,mine", 1)
-    camera.shoot(n=3)
-    camera.shoot(camera.bright, n=8)
-    assert camera.engine.status()["methods"] == ["set"]
-    camera.assert_measured_with(SETTINGS, camera.shoot())
-    # "set" has a number of its own again, after those of the methods that took turns.
-    assert camera.records["method"][-1] == 3
 
 
 @pytest.mark.usefixtures("tried_here")

@@ -2,17 +2,11 @@
 
 from typing import Any
 
-import numpy as np
 import pytest
-from tests.engine.bench import SETTINGS, Bench, make, simulated
 from tests.refusals import refused
 
 import faintspot as fs
-from faintspot.engine.request_handlers import commands_of
 from faintspot.engine.settings.interleaving import Interleaving, methods_after, short_names
-from faintspot.slopes.pipeline.settings import without_denoising
-
-pytestmark = pytest.mark.slow
 
 
 @pytest.mark.parametrize(
@@ -104,35 +98,3 @@ def test_methods_of_later_interleavings_have_numbers_of_their_own() -> None:
     garbage: list[dict[str, Any]] = [{}, {"changes": {"methods": "x", "first_method": 0}}]
     garbage += [{"changes": {"methods": ["x"], "first_method": number}} for number in (-1, 9, "0", None)]
     assert methods_after(["none", "tv"], garbage) == (["none", "tv"], 0)
-
-
-def test_methods_change_while_the_engine_runs(bench: Bench) -> None:
-    handlers = commands_of(bench.engine)
-    frames = simulated(12)
-    ring = bench.ring()
-    bench.attached()
-    for number in range(4):
-        bench.send(ring, number, frames[number])
-    for wrong in ({"methods": "none,nothing"}, {"methods": "ml,none", "every": 0}, {"methods": ["tv"]}, {}):
-        with pytest.raises(fs.InputError):
-            handlers["interleave"](wrong)
-    with pytest.raises(fs.InputError, match="search_range_px = -1"):  # found only when it is prepared
-        handlers["interleave"]({"methods": "none,search_range_px=-1"})
-    assert bench.engine.status()["methods"] == ["set"]
-    handlers["interleave"]({"methods": "none,tv", "every": 2})
-    for number in range(4, 12):
-        bench.send(ring, number, frames[number])
-    status = bench.engine.status()
-    assert (status["methods"], status["every"]) == (["none", "tv"], 2)
-    bench.until(lambda: bench.telemetry.changes_since(0)[0])
-    (change,), _, _ = bench.telemetry.changes_since(0)
-    assert change["changes"] == {"methods": ["none", "tv"], "first_method": 1, "every": 2}
-    at = change["frame"]
-    assert at in (4, 5)  # was waited for already, or not
-    assert bench.records["method"].tolist() == [0] * at + [1 + number // 2 % 2 for number in range(at, 12)]
-    for record, frame in zip(bench.records[at:], frames[at:], strict=True):
-        settings = without_denoising(SETTINGS, "") if record["method"] == 1 else SETTINGS
-        assert np.array_equal(np.concatenate([record["x"], record["y"]]), make(settings)(frame).vector)
-    handlers["set"]({"changes": {"noise_std": 2.0}})  # the methods stay
-    bench.send(ring, 12, frames[0])
-    assert bench.engine.live.running.interleaving.labels == ["none", "tv"]

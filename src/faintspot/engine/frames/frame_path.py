@@ -285,6 +285,9 @@ class FramePath:
         completed = self._work(0, frame, self._progress, explain, parts[0], rehearse)
         return self._workers.wait() and completed
 
+    def locate(self) -> None:
+        """Find the positions, after the slot is known to have held the frame; kernels have found them."""
+
     def flag_doubtful(self) -> None:
         """Set the flags of the last frame that depend on all its slopes; see `SlopePipeline`."""
         self._checks[self._slot]()

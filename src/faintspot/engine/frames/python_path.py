@@ -179,14 +179,15 @@ class PythonPath(FramePath):
         product: Sequence[ProductPart] = (),
         **waiting: Any,
     ) -> bool:
-        """Measure a frame, waiting for its rows; see `FramePath.measure`. No product is begun."""
-        if not super().measure(number, slot, explain=True, **waiting):
-            return False
+        """Calibrate a frame, waiting for its rows; see `FramePath.measure`. No product is begun."""
+        return super().measure(number, slot, explain=True, **waiting)
+
+    def locate(self) -> None:
+        """Let the estimator find the positions in the frame that was calibrated last."""
         result = self._find_positions() if self.fault is None else self.fault
         self.failed = isinstance(result, str)
         positions = None if isinstance(result, str) else result
         self._prepared.write(positions, self._wide.settings, 0, self._results)
-        return True
 
     def _find_positions(self) -> Found:
         """Get the positions from the estimator's thread; set `fault` when the estimator is disabled."""

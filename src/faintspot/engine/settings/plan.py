@@ -192,7 +192,8 @@ class SettingsPreparer:
     def _fallback(self, settings: Settings) -> EnginePlan:
         """Prepare the same settings with a built-in estimator and no interleaving."""
         settings, turns = self.built_in(settings), self.interleaving
-        alone = turns if len(turns.methods) == 1 else Interleaving(first=turns.first + len(turns.methods))
+        is_alone = len(turns.methods) == 1 and not turns.methods[0].changes
+        alone = turns if is_alone else Interleaving(first=turns.first + len(turns.methods))
         return EnginePlan([self.make_pipeline(settings)], settings, alone, self._new_path)
 
     def _new_path(self, pipeline: SlopePipeline, pixels: NDArray[Any], progress: Progress) -> FramePath:

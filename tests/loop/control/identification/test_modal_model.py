@@ -109,6 +109,7 @@ def test_controller_from_a_file_does_the_same(tip_tilt: PredictiveControl, tmp_p
         np.testing.assert_allclose(command, line.latest, atol=1e-9)
 
 
+@pytest.mark.hypothesis
 def test_a_controller_is_its_model_whatever_comes(tip_tilt: PredictiveControl) -> None:
     try_states(type("TipTilt", (Controls,), {"learnt": tip_tilt}), 25, 10)
 
