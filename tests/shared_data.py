@@ -1,6 +1,7 @@
 """Where tests find the files of the project, and real frames and reference values that are not part of it."""
 
 import os
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
@@ -16,3 +17,9 @@ def shared_file(name: str) -> Path:
     if not path.exists():
         pytest.skip(f"needs {name}, which is not part of the project (set FAINTSPOT_SHARED to its folder)")
     return path
+
+
+def skip_without(package: str) -> None:
+    """Skip the tests of a module where a package is not installed; import none, which takes seconds."""
+    if find_spec(package) is None:
+        pytest.skip(f"{package} is not installed", allow_module_level=True)

@@ -10,6 +10,7 @@ import pytest
 from tests.cli.cli_cases import STUDY, Commands, command_line
 from tests.experiments.experiment_cases import SEARCH, small
 from tests.experiments.result_cases import made_up_magnitude
+from tests.shared_data import skip_without
 
 from faintspot.cli import study as command
 from faintspot.experiments import StudySpecification, Sweep, WorkerPool, open_study
@@ -106,7 +107,7 @@ def test_killed_and_started_again(folder: Path, run: Commands) -> None:
     assert found == expected
 
 
-pytest.importorskip("hcipy")
+skip_without("hcipy")
 
 
 @pytest.fixture(autouse=True)

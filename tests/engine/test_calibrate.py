@@ -10,6 +10,7 @@ from uuid import uuid4
 import numpy as np
 import pytest
 from click.testing import CliRunner, Result
+from tests.shared_data import skip_without
 
 from faintspot.base.errors import InputError
 from faintspot.cli.realtime.learn import calibrate
@@ -17,7 +18,7 @@ from faintspot.engine.control.poking import StreamedMirror
 from faintspot.loop.control import mirror_calibration
 from faintspot.loop.control.configuration import Control, load_control, save_control
 
-pytest.importorskip("hcipy")
+skip_without("hcipy")
 pytest.importorskip("matplotlib")
 pyshmem = pytest.importorskip("pyshmem")
 

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tests.shared_data import skip_without
 
 from faintspot.base.errors import InputError
 from faintspot.engine.processes.requests import request, socket_path
@@ -19,7 +20,7 @@ from faintspot.loop.simulation import Method, simulate_loop
 from faintspot.loop.simulation.telescope import TelescopeModel
 from faintspot.slopes.pipeline import configuration as configuration_file
 
-pytest.importorskip("hcipy")
+skip_without("hcipy")
 pyshmem = pytest.importorskip("pyshmem")
 
 from tests.engine.closed_loop import COMMANDS, CONFIGURATION, PATIENCE_S, Sky, make_engine  # noqa: E402

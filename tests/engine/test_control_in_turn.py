@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from tests.refusals import refused
+from tests.shared_data import skip_without
 
 import faintspot as fs
 from faintspot.engine.request_handlers import commands_of
@@ -12,10 +13,11 @@ from faintspot.engine.settings.interleaving import Interleaving
 from faintspot.loop.control.configuration import Control
 from faintspot.loop.control.kalman.compiled import CompiledKalman
 
-pytest.importorskip("hcipy")
 pytest.importorskip("pyshmem")
 
 from tests.engine.closed_loop import CONFIGURATION, Sky, configured, make_engine
+
+skip_without("hcipy")
 
 pytestmark = pytest.mark.slow
 

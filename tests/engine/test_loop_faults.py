@@ -11,13 +11,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from tests.shared_data import skip_without
 
 from faintspot.engine.processes.segment import FOLDER
 from faintspot.engine.streams.shared_streams import _base
 from faintspot.io import read_telemetry
 from faintspot.loop.control.configuration import Control
 
-pytest.importorskip("hcipy")
+skip_without("hcipy")
 pyshmem = pytest.importorskip("pyshmem")
 
 from tests.engine.closed_loop import COMMANDS, PATIENCE_S, Sky, make_engine  # noqa: E402

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from tests.shared_data import skip_without
 
 import faintspot as fs
 from faintspot.engine.settings.interleaving import Interleaving
@@ -14,11 +15,12 @@ from faintspot.experiments.night.recorded import recorded_night
 from faintspot.experiments.night.recorded_methods import MeasuredStrehl
 from faintspot.loop.simulation import Method, simulate_loop
 
-pytest.importorskip("hcipy")
 pytest.importorskip("pyshmem")
 pytest.importorskip("zarr")
 
 from tests.engine.closed_loop import CONFIGURATION, Sky, configured, make_engine
+
+skip_without("hcipy")
 
 pytestmark = pytest.mark.slow
 

@@ -8,6 +8,7 @@ from uuid import uuid4
 
 import numpy as np
 import pytest
+from tests.shared_data import skip_without
 
 import faintspot as fs
 from faintspot.engine.frames.workers import SlopePrior
@@ -17,7 +18,7 @@ from faintspot.loop.simulation import Method, simulate_loop
 from faintspot.loop.simulation.learning import learnt_control
 from faintspot.slopes.pipeline import configuration as configuration_file
 
-pytest.importorskip("hcipy")
+skip_without("hcipy")
 pyshmem = pytest.importorskip("pyshmem")
 
 from tests.engine.closed_loop import CONFIGURATION, Sky, configured, make_engine  # noqa: E402

@@ -22,6 +22,7 @@ from tests.engine.commands import needs_shared_memory, start
 from tests.loop.simulation.loop_cases import faint, plain
 from tests.patience import wait_for
 from tests.refusals import assert_each_refused, refused
+from tests.shared_data import skip_without
 
 import faintspot
 import faintspot as fs
@@ -43,7 +44,7 @@ from faintspot.loop.simulation.engine_files import write_engine_files
 from faintspot.loop.simulation.telescope import TelescopeModel, make_pipeline
 from faintspot.slopes.pipeline import configuration as configuration_file
 
-pytest.importorskip("hcipy")
+skip_without("hcipy")
 pyshmem = pytest.importorskip("pyshmem")
 pytestmark = [needs_shared_memory, pytest.mark.slow]
 CONFIGURATION = faint().replace("control", frame_rate_hz=1000.0)  # runs of single frames take no longer

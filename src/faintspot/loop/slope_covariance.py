@@ -18,8 +18,8 @@ from functools import cached_property, lru_cache
 from typing import Self
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.interpolate import CubicSpline
 
 from faintspot.base.arrays import Floats
 from faintspot.base.errors import InputError
@@ -202,7 +202,7 @@ class _Structure:
         self._scale = outer_scale_m
         if math.isfinite(outer_scale_m):
             line = np.geomspace(_SMALLEST, _LARGEST, _NODES)
-            self._table = CubicSpline(np.log(line), np.log(structure_function(line, 1.0)))
+            self._table = scipy.interpolate.CubicSpline(np.log(line), np.log(structure_function(line, 1.0)))
 
     def __call__(self, square_m2: Floats) -> Floats:
         square = np.maximum(square_m2, 1e-20)

@@ -12,6 +12,7 @@ import pytest
 from rich.console import Console
 from tests.cli.cli_cases import Commands
 from tests.engine.commands import start
+from tests.shared_data import skip_without
 
 from faintspot.base.errors import InputError
 from faintspot.cli.realtime.telescope import in_words, methods_table, write_strehl
@@ -29,7 +30,7 @@ def test_times_are_those_of_the_middle_of_an_exposure(tmp_path: Path) -> None:
     assert written[1:].tolist() == [0.5, 10.0]
 
 
-pytest.importorskip("hcipy")
+skip_without("hcipy")
 pytest.importorskip("pyshmem")
 pytest.importorskip("tornado")
 pytest.importorskip("zarr")

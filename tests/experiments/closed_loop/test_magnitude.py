@@ -5,13 +5,14 @@ import numpy as np
 import pytest
 from tests.experiments.experiment_cases import HERE, SEARCH, StopsAfter, assert_same_files, small
 from tests.refusals import refused
+from tests.shared_data import skip_without
 
 from faintspot.experiments.closed_loop.magnitude import quick_run, run_magnitude
 from faintspot.experiments.closed_loop.results import MagnitudeResult
 from faintspot.experiments.running import WorkerPool
 from faintspot.loop.simulation.record import MAGNITUDE_FILE
 
-pytest.importorskip("hcipy")
+skip_without("hcipy")
 METHODS = ("centroid", "brightest")
 PHOTONS = (400.0, 40.0)
 

@@ -4,6 +4,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from tests.experiments.result_cases import LABELS, made_up_magnitude, result_of
+from tests.shared_data import skip_without
 
 from faintspot.base.report.page import FigureWithData
 from faintspot.experiments.closed_loop.magnitude import save_recommended
@@ -20,7 +21,7 @@ from faintspot.experiments.closed_loop.verdict import (
 from faintspot.loop.simulation.configuration import load_loop
 from faintspot.slopes.pipeline.settings import Settings
 
-pytest.importorskip("hcipy")
+skip_without("hcipy")
 
 NOWHERE = "TV raises the Strehl ratio nowhere beyond its error"
 

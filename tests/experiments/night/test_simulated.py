@@ -4,6 +4,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from tests.experiments.experiment_cases import HERE, StopsAfter, assert_same_files, small
+from tests.shared_data import skip_without
 
 from faintspot.base.errors import InputError
 from faintspot.experiments.night.protocol import NightPlan, load_night
@@ -12,7 +13,7 @@ from faintspot.experiments.running import WorkerPool
 from faintspot.loop.simulation import simulate_loop
 from faintspot.loop.simulation.record import slope_turbulence
 
-pytest.importorskip("hcipy")
+skip_without("hcipy")
 pytest.importorskip("zarr")
 
 PLAN = NightPlan(

@@ -3,12 +3,13 @@ from typing import Any
 import numpy as np
 import pytest
 from tests.loop.simulation.loop_cases import quiet
+from tests.shared_data import skip_without
 
 from faintspot.base.errors import InputError
 from faintspot.loop.simulation import LoopConfiguration, load_loop
 from faintspot.loop.simulation.atmosphere import make_atmosphere
 
-hcipy = pytest.importorskip("hcipy")
+skip_without("hcipy")
 NM_TO_RAD = 2 * np.pi / 500
 
 
@@ -32,6 +33,8 @@ def test_structure_function_is_von_karmans() -> None:
         for screen, part in zip(atmosphere.screens, quiet().atmosphere.fraction, strict=True):
             radians = screen * (NM_TO_RAD * 0.15 ** (-5 / 6) / np.sqrt(part))
             measured.append([np.mean((radians - np.roll(radians, s, axis=0)) ** 2) for s in separations])
+    import hcipy
+
     grid = hcipy.CartesianGrid(hcipy.UnstructuredCoords((separations * 0.05, np.zeros(6))))
     expected = np.array(hcipy.phase_structure_function_von_karman(0.15, 25.0)(grid))
     np.testing.assert_allclose(np.mean(measured, axis=0), expected, rtol=0.05)
@@ -42,6 +45,8 @@ def test_small_structures_survive_the_interpolation() -> None:
     atmosphere = make_atmosphere(quiet(), 7, 0)
     fronts = np.array([atmosphere.wavefront_nm(t) for t in np.arange(0, 8, 0.05)])
     structure = np.mean((fronts[:, 2:] - fronts[:, :-2]) ** 2) * NM_TO_RAD**2
+    import hcipy
+
     grid = hcipy.CartesianGrid(hcipy.UnstructuredCoords((np.array([0.1]), np.zeros(1))))
     expected = float(hcipy.phase_structure_function_von_karman(0.15, 25.0)(grid)[0])
     assert 0.9 < structure / expected < 1.0

@@ -4,11 +4,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from tests.loop.simulation.loop_cases import faint, plain
+from tests.shared_data import skip_without
 
 from faintspot.base.errors import InputError
 from faintspot.loop.simulation import LoopRecord, simulate_loop
 
-pytest.importorskip("hcipy")
+skip_without("hcipy")
 
 
 @pytest.fixture(scope="module")

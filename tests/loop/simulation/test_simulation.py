@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 from tests.loop.simulation.best_fit import BestFit
 from tests.loop.simulation.loop_cases import PLAIN, faint, plain, quiet
+from tests.shared_data import skip_without
 
 import faintspot as fs
 from faintspot.base.errors import InputError
@@ -10,7 +11,7 @@ from faintspot.loop.simulation.atmosphere import make_atmosphere
 from faintspot.loop.simulation.simulation import measure_gains
 from faintspot.loop.simulation.telescope import make_pipeline, prepare
 
-pytest.importorskip("hcipy")
+skip_without("hcipy")
 
 
 @pytest.fixture(scope="module")

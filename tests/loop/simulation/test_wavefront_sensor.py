@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from tests.loop.simulation.best_fit import BestFit
 from tests.loop.simulation.loop_cases import quiet
+from tests.shared_data import skip_without
 
 import faintspot as fs
 from faintspot.base.errors import InputError, MissingExtraError
@@ -11,7 +12,7 @@ from faintspot.loop.simulation import load_loop
 from faintspot.loop.simulation.atmosphere import make_atmosphere
 from faintspot.loop.simulation.wavefront_sensor import ShackHartmann, make_mirror, make_pupil, make_sensor
 
-pytest.importorskip("hcipy")
+skip_without("hcipy")
 FLAT = np.zeros((84, 84), np.float32)
 
 
@@ -101,9 +102,6 @@ def test_nothing_illuminated_is_refused() -> None:
         make_sensor(dark, make_pupil(dark))
 
 
-pytest.importorskip("hcipy")
-
-
 def test_commands_add_up() -> None:
     pupil = make_pupil(quiet())
     mirror = make_mirror(quiet(), pupil)
@@ -159,7 +157,6 @@ def test_the_best_fit_takes_off_what_the_mirror_can_do() -> None:
     assert pupil.rms(left) < 0.1
 
 
-pytest.importorskip("hcipy")
 WAVELENGTH_M = 1.65e-6
 
 

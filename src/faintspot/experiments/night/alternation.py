@@ -10,8 +10,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.linalg import cho_factor, cho_solve
 
 from faintspot.base.arrays import Floats
 from faintspot.base.statistics import FEWEST_PIECES, Estimate, student
@@ -52,11 +52,11 @@ def likeliest_drift(design: Floats, values: Floats, time_s: Floats) -> Drift:
 
 def _likelihood(design: Floats, values: Floats, correlation: Floats) -> float:
     """Return the logarithm of the restricted likelihood, apart from a constant."""
-    factor = cho_factor(correlation, lower=True)
-    weighted = cho_solve(factor, design)
+    factor = scipy.linalg.cho_factor(correlation, lower=True)
+    weighted = scipy.linalg.cho_solve(factor, design)
     information = design.T @ weighted
     residual = values - design @ (np.linalg.pinv(information) @ (weighted.T @ values))
-    square = float(residual @ cho_solve(factor, residual))
+    square = float(residual @ scipy.linalg.cho_solve(factor, residual))
     free = len(values) - np.linalg.matrix_rank(design)
     if square <= 0 or free <= 0:
         return -math.inf
@@ -68,7 +68,7 @@ def _likelihood(design: Floats, values: Floats, correlation: Floats) -> float:
 
 def coefficients(design: Floats, values: Floats, correlation: Floats) -> Floats:
     """Return the coefficients of a generalised least-squares fit, (p,)."""
-    weighted = cho_solve(cho_factor(correlation, lower=True), design)
+    weighted = scipy.linalg.cho_solve(scipy.linalg.cho_factor(correlation, lower=True), design)
     return np.asarray(np.linalg.pinv(design.T @ weighted) @ (weighted.T @ values))
 
 

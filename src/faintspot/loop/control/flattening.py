@@ -4,8 +4,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike, NDArray
-from scipy.optimize import lsq_linear
 
 from faintspot.base.arrays import Floats
 from faintspot.base.checks import finite_array, number_between
@@ -140,7 +140,7 @@ def _command(reconstructor: Reconstructor, slopes: Floats, stroke: float | None)
     actuators = len(command)
     driven = reconstructor.slopes_of_modes @ reconstructor.modes.T
     damping = np.sqrt(reconstructor.damping) * np.eye(actuators)
-    bounded = lsq_linear(
+    bounded = scipy.optimize.lsq_linear(
         np.concatenate([driven, damping]),
         np.concatenate([slopes, np.zeros(actuators)]),
         (-stroke, stroke),

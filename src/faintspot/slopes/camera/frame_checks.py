@@ -3,7 +3,7 @@
 from typing import Any
 
 import numpy as np
-import scipy.ndimage
+import scipy
 from numpy.typing import ArrayLike, NDArray
 
 from faintspot.base.checks import real_array

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike
-from scipy.special import chdtri
 
 from faintspot.base.arrays import Floats
 from faintspot.base.checks import finite_array, number_between
@@ -173,7 +173,7 @@ def _measure_dark(darks: Floats) -> tuple[_Dark, Estimate]:
     variance = np.var(residuals, axis=0, ddof=1)
     degrees = len(darks) - 1
     # The median of a chi-squared distribution lies below its mean.
-    read_noise = math.sqrt(float(np.median(variance)) * degrees / float(chdtri(degrees, 0.5)))
+    read_noise = math.sqrt(float(np.median(variance)) * degrees / float(scipy.special.chdtri(degrees, 0.5)))
     # Variance of the median of many variances: 1.25 times that of their mean.
     relative = 1.25 * math.sqrt(2 / (degrees * level.size))
     spread = 1.25 * MAD_TO_STD * float(np.median(np.abs(level - np.median(level)))) / math.sqrt(level.size)
@@ -196,7 +196,7 @@ def _read_noise_without_darks(curve: TransferCurve, line: LineFit | None) -> Est
     """Estimate the read noise from the darkest pixels, less the photon noise that the line gives."""
     darkest = curve.mean <= np.quantile(curve.mean, _DARKEST_FOR_NOISE)
     # The median of a chi-squared distribution lies below its mean.
-    correction = curve.degrees / float(chdtri(curve.degrees, 0.5))
+    correction = curve.degrees / float(scipy.special.chdtri(curve.degrees, 0.5))
     total = float(np.median((curve.variance / np.maximum(curve.share, 0.1))[darkest])) * correction
     photons = 0.0 if line is None else max(line.slope, 0.0) * float(np.mean(curve.mean[darkest]))
     # If photon noise alone would explain the variance, the line is not valid for these pixels.

@@ -7,8 +7,8 @@ from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.ndimage import spline_filter1d
 
 from faintspot.base.arrays import Floats
 from faintspot.base.checks import numbers_between
@@ -93,7 +93,7 @@ def photon_transfer(frames: Floats, dark_level: Any, layout: Layout | None, orde
 
 def _derivative(image: Floats, axis: int) -> Floats:
     """Return the derivative per pixel of a quintic spline, which suits critically sampled spots."""
-    coefficients = np.moveaxis(spline_filter1d(image, 5, axis=axis, mode="mirror"), axis, 0)
+    coefficients = np.moveaxis(scipy.ndimage.spline_filter1d(image, 5, axis=axis, mode="mirror"), axis, 0)
     c = np.pad(coefficients, ((2, 2), (0, 0)), mode="reflect")
     slope: Floats = (10 * (c[3:-1] - c[1:-3]) + c[4:] - c[:-4]) / 24
     return np.moveaxis(slope, 0, axis)

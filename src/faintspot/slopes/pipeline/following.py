@@ -4,9 +4,8 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-import scipy.ndimage
+import scipy
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial import cKDTree
 
 from faintspot.base.checks import LARGEST_FLOAT32, real_array
 from faintspot.base.errors import InputError
@@ -260,7 +259,7 @@ class SpotFollower:
         """Replace the pixels that are nearer to another spot than to the window's own by its median."""
         reach = 0.5 * np.array(images.shape[:0:-1]) + 2.0 * (self._width_px or 1.0)
         scaled = as_rows(spots) / reach
-        pairs = cKDTree(scaled).query_pairs(1.0, p=np.inf, output_type="ndarray")
+        pairs = scipy.spatial.cKDTree(scaled).query_pairs(1.0, p=np.inf, output_type="ndarray")
         first, second = np.concatenate([pairs, pairs[:, ::-1]]).T
         pixels = columns[first] + 1j * rows[first]
         nearer = np.abs(pixels - spots[second, None, None]) < np.abs(pixels - spots[first, None, None])
@@ -283,7 +282,8 @@ class SpotFollower:
         index = np.arange(len(spots)) if used is None else np.flatnonzero(used)
         crossing = np.zeros(len(spots), bool)
         if len(index) > 1:
-            crossing[index[cKDTree(as_rows(spots[index])).query_pairs(apart, output_type="ndarray")]] = True
+            tree = scipy.spatial.cKDTree(as_rows(spots[index]))
+            crossing[index[tree.query_pairs(apart, output_type="ndarray")]] = True
         return crossing
 
     def _moved(self, expected: Complex, at: Complex, valid: NDArray[np.bool_]) -> Complex:

@@ -5,8 +5,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-import scipy.ndimage
-import scipy.special
+import scipy
 from numpy.typing import ArrayLike, NDArray
 
 from faintspot.base.arrays import Floats

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.ndimage import binary_closing
 
 from faintspot.base.arrays import Floats
 from faintspot.base.report import plots
@@ -85,7 +85,8 @@ def sensor_figure(example: Example) -> FigureWithData:
     layout, images = example.layout, example.first.calibrated
     sheet, start = assembled(layout, images), layout.corners.min(axis=0) - 0.5
     # Gaps of a pixel between windows, where the pitch is not a whole number, are no lines.
-    closed = binary_closing(np.pad(np.isfinite(sheet), 1, mode="edge"), np.ones((3, 3)))[1:-1, 1:-1]
+    known = np.pad(np.isfinite(sheet), 1, mode="edge")
+    closed = scipy.ndimage.binary_closing(known, np.ones((3, 3)))[1:-1, 1:-1]
     sheet[closed & np.isnan(sheet)] = np.nanmedian(images)
     (low, high), (n_rows, n_columns) = plots.limits_of(images, percent=99.8), sheet.shape
     extent = start[1], start[1] + n_columns, start[0], start[0] + n_rows

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from faintspot.base.arrays import Floats
 from faintspot.base.errors import InputError, errors_within
@@ -204,7 +204,7 @@ def _change(pipeline: SlopePipeline, frames: NDArray[Any], dark: Floats, step_px
     changes = []
     for axis, direction in (("x", (0, 0, step_px)), ("y", (0, step_px, 0))):
         ahead, behind = (
-            dark + ndimage.shift(light, sign * np.array(direction), order=order, mode="nearest")
+            dark + scipy.ndimage.shift(light, sign * np.array(direction), order=order, mode="nearest")
             for sign in (1, -1)
         )
         ahead, behind = (getattr(pipeline(each.astype(np.float32)), axis) for each in (ahead, behind))

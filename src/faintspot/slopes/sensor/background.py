@@ -1,10 +1,8 @@
 """Background of frames with spots: smooth in the frame, or of single lenslets."""
 
 import numpy as np
-import scipy.fft
-import scipy.ndimage
+import scipy
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from faintspot.base.arrays import Floats
 from faintspot.base.statistics import MAD_TO_STD
@@ -96,9 +94,9 @@ def _cells(
     around = (spots[:, None] + beside).ravel()
     nodes = np.column_stack([spots.real, spots.imag])
     others = np.column_stack([around.real, around.imag])
-    dark = cKDTree(nodes).query(others)[0] > _DARK_NODE * pitch_px
+    dark = scipy.spatial.cKDTree(nodes).query(others)[0] > _DARK_NODE * pitch_px
     y, x = np.indices(shape)
-    tree = cKDTree(np.concatenate([nodes, others[dark]]))
+    tree = scipy.spatial.cKDTree(np.concatenate([nodes, others[dark]]))
     away_px, nearest = tree.query(np.stack([x, y], axis=-1))
     return away_px, nearest
 

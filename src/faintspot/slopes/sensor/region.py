@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 from types import EllipsisType
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from faintspot.base.checks import numbers_between
 from faintspot.base.errors import InputError
@@ -152,6 +152,6 @@ def as_rows(at: NDArray[np.complex128]) -> NDArray[np.float64]:
     return np.column_stack([at.real, at.imag])
 
 
-def as_tree(at: NDArray[np.complex128]) -> cKDTree:
+def as_tree(at: NDArray[np.complex128]) -> scipy.spatial.cKDTree:
     """Return a tree of complex positions, in which near ones are found."""
-    return cKDTree(as_rows(at))
+    return scipy.spatial.cKDTree(as_rows(at))

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial import cKDTree
 
 from faintspot.base.errors import InputError
 from faintspot.slopes.sensor.detection.lenslets import LensletGrid, find_lenslets
@@ -54,7 +54,7 @@ class Windows:
         if len(spots) == 0:
             return spots
         middles = self.corners[:, ::-1] + 0.5 * (np.array(self.window[::-1]) - 1)
-        _, near = cKDTree(middles).query(spots, min(4, len(middles)), p=np.inf)
+        _, near = scipy.spatial.cKDTree(middles).query(spots, min(4, len(middles)), p=np.inf)
         near = near.reshape(len(spots), -1)
         return np.asarray(spots[(self.depth(spots[:, None], near) < 0).all(axis=1)])
 
@@ -113,7 +113,7 @@ def find_windows(
 
 def _largest_window(middles: NDArray[np.float64], pitch_px: float) -> tuple[int, int]:
     """Return the largest square window without overlap, with windows moved by at most half a pixel."""
-    distances = np.asarray(cKDTree(middles).query(middles, k=2, p=np.inf)[0])[:, 1]
+    distances = np.asarray(scipy.spatial.cKDTree(middles).query(middles, k=2, p=np.inf)[0])[:, 1]
     clear = float(np.min(distances[np.isfinite(distances)], initial=pitch_px))
     side = int(np.rint(clear))
     if (side / clear - 1) * _half_extent(middles) > _SPREAD_PX:
@@ -131,7 +131,7 @@ def _spread(middles: NDArray[np.float64], window: tuple[int, int]) -> NDArray[np
 
     Centres at least a window apart keep that distance when rounded to whole pixels.
     """
-    pairs = cKDTree(middles).query_pairs(max(window), p=np.inf, output_type="ndarray")
+    pairs = scipy.spatial.cKDTree(middles).query_pairs(max(window), p=np.inf, output_type="ndarray")
     apart = np.abs(middles[pairs[:, 0]] - middles[pairs[:, 1]]) / np.array(window)
     closest = float(np.min(apart.max(axis=1), initial=1.0))
     if closest >= 1 or (1 / closest - 1) * _half_extent(middles) > _SPREAD_PX:

@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike
-from scipy.optimize import minimize_scalar
 
 from faintspot.base.arrays import Floats
 from faintspot.base.checks import finite_array
@@ -177,7 +177,7 @@ def spot_range(images: Images, psf: PSF) -> SpotRange:
     squares = _Squares.of(images.pixels_e.shape[1:], psf)
     few = images.some(_IMAGES_FOR_SCALE)
     bounds = (math.log(_SCALES[0]), math.log(_SCALES[1]))
-    best = minimize_scalar(
+    best = scipy.optimize.minimize_scalar(
         lambda log_scale: -_mixed(*squares.evidence(few, math.exp(log_scale))).log_likelihood,
         bounds=bounds,
         method="bounded",

@@ -5,9 +5,8 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.interpolate import BSpline
-from scipy.linalg import solve
 
 from faintspot.base.arrays import Floats
 from faintspot.slopes.training.registration import FINE, Sums, offsets
@@ -55,7 +54,7 @@ class PSFFit(NamedTuple):
 def spline_basis(at: Floats, radius_px: float, nodes_per_px: float) -> Floats:
     """Cubic B-splines at nodes within the radius, (n, n_nodes): they fall to zero a little inside it."""
     reach = round(radius_px * nodes_per_px) - 2
-    element = BSpline.basis_element(np.arange(-2, 3), extrapolate=False)
+    element = scipy.interpolate.BSpline.basis_element(np.arange(-2, 3), extrapolate=False)
     u = at[:, None] * nodes_per_px - np.arange(-reach, reach + 1)
     basis: Floats = np.nan_to_num(element(u))
     return basis
@@ -206,7 +205,7 @@ def _with_deviation(sums: Sums, fit: PSFFit, deviation: float, radius_px: float)
     right = right[:half] + right[: half - 2 : -1]
     normal = normal[:half] + normal[: half - 2 : -1]
     normal = normal[:, :half] + normal[:, : half - 2 : -1]
-    first = solve(normal, right, assume_a="pos")
+    first = scipy.linalg.solve(normal, right, assume_a="pos")
     first[-1] *= 2  # the middle one, added to itself
     coefficients = np.concatenate([first, first[-2::-1]]).reshape(n, n)
     plane = product + basis @ coefficients @ basis.T

@@ -7,8 +7,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter
 
 from faintspot.base.arrays import Floats
 from faintspot.base.errors import InputError
@@ -68,7 +68,7 @@ def measured_width(stack: Stack) -> float:
 
     def response(fwhm_px: float) -> float:
         std = fwhm_px / 2.3548
-        peaks = gaussian_filter(images, std, mode="constant", axes=(1, 2)).max(axis=(1, 2))
+        peaks = scipy.ndimage.gaussian_filter(images, std, mode="constant", axes=(1, 2)).max(axis=(1, 2))
         return std * float(peaks.mean())  # a kernel of unit energy: the noise is the same at all widths
 
     return max(_START_WIDTHS_PX, key=response)

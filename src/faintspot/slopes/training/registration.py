@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter
 
 from faintspot.base.arrays import Floats
 from faintspot.slopes.spots.psf import PSF
@@ -142,12 +142,16 @@ def start(stack: Stack, tables: PSFTables, index: Integers, fwhm_px: Floats, sea
     for kind in np.unique(index):
         spots = np.flatnonzero(index == kind)
         std = _START_WIDTH * fwhm_px[kind, ::-1]
-        smoothed = gaussian_filter(stack.images[spots], std, mode="constant", axes=(1, 2), truncate=2.5)
+        smoothed = scipy.ndimage.gaussian_filter(
+            stack.images[spots], std, mode="constant", axes=(1, 2), truncate=2.5
+        )
         flat = np.where(allowed, smoothed, -np.inf).reshape(len(spots), -1)
         best = np.argmax(flat, axis=1)
         row, column = np.divmod(best, nx)
         positions[spots] = np.stack([offset_x[column], offset_y[row]], axis=1)
-        height = gaussian_filter(tables.value[kind], std * FINE, mode="constant", truncate=2.5).max()
+        height = scipy.ndimage.gaussian_filter(
+            tables.value[kind], std * FINE, mode="constant", truncate=2.5
+        ).max()
         flux[spots] = np.maximum(flat[np.arange(len(spots)), best] / height, 1.0)
     return Registered(positions, flux, np.full((n, 2, 2), np.inf))
 

@@ -9,7 +9,7 @@ to the Bootstrap).
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import stdtrit
+import scipy
 
 from faintspot.base.arrays import Floats
 from faintspot.base.checks import number_between
@@ -310,5 +310,5 @@ def fit_drift(wavefront: Wavefront, bins: int, *, frame_rate_hz: float | None = 
     rate = since @ mean / (since @ since)
     residual = mean - mean.mean(axis=0) - np.outer(since, rate)
     rate_error = np.sqrt(np.sum(residual**2, axis=0) / (bins - 2) / (since @ since))
-    half_width = stdtrit(bins - 2, 0.975) * rate_error
+    half_width = scipy.special.stdtrit(bins - 2, 0.975) * rate_error
     return Drift(time, mean, error, rate, rate_error, half_width, unit)

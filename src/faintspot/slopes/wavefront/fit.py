@@ -5,9 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
-from scipy.special import stdtrit
 
 from faintspot.base.arrays import Floats
 from faintspot.base.checks import not_none, number_between
@@ -144,13 +143,13 @@ class Wavefront:
     @property
     def mean_half_width(self) -> Floats:
         """Half width of the 95 % interval of the mean, (k,), by Student's distribution."""
-        width: Floats = stdtrit(self.degrees_of_freedom, 0.975) * self.mean_standard_error
+        width: Floats = scipy.special.stdtrit(self.degrees_of_freedom, 0.975) * self.mean_standard_error
         return width
 
     def is_lit(self, x: Floats, y: Floats) -> NDArray[np.bool_]:
         """Return which points (p,), in radii, lie within the disk and a sub-aperture with valid slopes."""
         points = np.stack([x, y], axis=-1)
-        nearest = self.outlines[cKDTree(self.outlines.mean(axis=1)).query(points)[1]]
+        nearest = self.outlines[scipy.spatial.cKDTree(self.outlines.mean(axis=1)).query(points)[1]]
         edges, away = np.roll(nearest, -1, axis=1) - nearest, points[:, None] - nearest
         left = edges[..., 0] * away[..., 1] - edges[..., 1] * away[..., 0]
         return np.asarray((left >= -_ROUNDING).all(axis=1) & (np.hypot(x, y) <= 1 + _ROUNDING))

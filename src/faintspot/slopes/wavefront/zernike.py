@@ -4,8 +4,8 @@ Noll (1976), JOSA 66, 207: mode j has mean square 1 over the unit disk, and even
 """
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike
-from scipy.special import eval_jacobi
 
 from faintspot.base.arrays import Floats
 
@@ -59,7 +59,7 @@ def zernike(j: int, x: ArrayLike, y: ArrayLike) -> Floats:
     x, y = np.asarray(x, np.float64), np.asarray(y, np.float64)
     around = (x + 1j * y) ** m  # r^m with cosine and sine of m times the angle
     k = (n - m) // 2
-    radial = (-1) ** k * eval_jacobi(k, m, 0, 1 - 2 * (x**2 + y**2))
+    radial = (-1) ** k * scipy.special.eval_jacobi(k, m, 0, 1 - 2 * (x**2 + y**2))
     norm = np.sqrt((n + 1) * (1 if m == 0 else 2))
     mode: Floats = norm * radial * (around.real if signed >= 0 else around.imag)
     return mode

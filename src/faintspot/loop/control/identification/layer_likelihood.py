@@ -14,8 +14,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.optimize import minimize
 
 from faintspot.base.arrays import Floats
 from faintspot.base.errors import InputError
@@ -223,7 +223,7 @@ class LayerLikelihood:
             gradient[-1] += prior / OUTER_SCALE_SPREAD
             return (value + 0.5 * prior**2) / scale, gradient / scale
 
-        fit = minimize(
+        fit = scipy.optimize.minimize(
             misfit,
             _packed(start),
             jac=True,

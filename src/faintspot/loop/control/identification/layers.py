@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
-from scipy.optimize import minimize
+import scipy
 
 from faintspot.base.arrays import Floats
 from faintspot.loop.control.base import OpenLoopTelemetry
@@ -114,7 +114,7 @@ class _Fit:
         return np.log([frequency, damping, max(power, 1e-9 * self._variance)])
 
     def _refined(self, start: Floats) -> tuple[Floats, float]:
-        fit = minimize(self._misfit, start, method="L-BFGS-B")
+        fit = scipy.optimize.minimize(self._misfit, start, method="L-BFGS-B")
         return fit.x, float(fit.fun)
 
     def _misfit(self, x: Floats) -> float:

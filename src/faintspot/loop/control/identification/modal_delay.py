@@ -13,9 +13,8 @@ from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.ndimage import median_filter
-from scipy.signal import welch
 
 from faintspot.base.arrays import Floats
 from faintspot.base.errors import InputError
@@ -185,7 +184,7 @@ def _shapes(window: Floats, lines: Floats, knees: Sequence[float]) -> Floats:
 
 def _lines(power: Floats, independent: float) -> NDArray[np.bool_]:
     """Return where spectra have lines of vibrations, (modes, frequencies): not in most modes."""
-    background = median_filter(power, (1, _BACKGROUND), mode="nearest")
+    background = scipy.ndimage.median_filter(power, (1, _BACKGROUND), mode="nearest")
     high = power > (1 + _LINE / math.sqrt(independent)) * background
     return np.asarray(high if len(power) < _FEW_MODES else high & (high.mean(axis=0) <= 0.5))
 
@@ -284,7 +283,7 @@ def spectra_of_modes(modes: Floats, without: slice = slice(0)) -> tuple[Floats, 
     filled = np.array([np.interp(rows, rows[measured], values[measured]) for values in modes.T]).T
     length, used = length_of_piece(len(modes)), np.delete(filled, without, axis=0)
     used -= used.mean(axis=0)
-    frequency, power = welch(used, nperseg=length, detrend=False, return_onesided=False, axis=0)
+    frequency, power = scipy.signal.welch(used, nperseg=length, detrend=False, return_onesided=False, axis=0)
     noise = np.median(power[np.abs(frequency) > _PLATEAU], axis=0)
     return power, np.maximum(noise, _LEAST_NOISE * np.var(filled, axis=0))
 

@@ -8,8 +8,8 @@ from dataclasses import KW_ONLY, dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.signal import csd, welch
 
 from faintspot.base.arrays import Floats
 from faintspot.base.checks import (
@@ -532,8 +532,11 @@ def _coherence(controlled: Floats, caused: Floats) -> tuple[float, float]:
     moving = np.flatnonzero(controlled.any(axis=0) & caused.any(axis=0))[:_MOST_COMPARED]
     one, other = controlled[1:, moving].T, np.diff(caused[:, moving], axis=0).T
     pieces = max(2, 2 * one.shape[1] // _WINDOW - 1)
-    crossed = csd(one, other, nperseg=_WINDOW)[1][:, 1:]
-    power = welch(one, nperseg=_WINDOW)[1][:, 1:] * welch(other, nperseg=_WINDOW)[1][:, 1:]
+    crossed = scipy.signal.csd(one, other, nperseg=_WINDOW)[1][:, 1:]
+    power = (
+        scipy.signal.welch(one, nperseg=_WINDOW)[1][:, 1:]
+        * scipy.signal.welch(other, nperseg=_WINDOW)[1][:, 1:]
+    )
     coherency = crossed / np.sqrt(np.maximum(power, 1e-300))
     slow = coherency[:, : _WINDOW // _SLOW]
     in_phase = float(slow.real.sum() / max(float(np.abs(slow).sum()), 1e-300))

@@ -12,7 +12,7 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from scipy.ndimage import uniform_filter1d
+import scipy
 
 from faintspot.base.arrays import Floats
 from faintspot.loop.control.identification.loop_delay import FEWEST_SUBAPERTURES, INDEPENDENT, bins_of
@@ -76,7 +76,9 @@ def _noise(slopes: Floats) -> SlopeNoise:
     pieces = np.nanmean(power[known].reshape(np.count_nonzero(known), -1, 2, m // 2), axis=3)
     mean = pieces.mean(axis=0)
     mean = np.maximum(mean, 1e-12 * float(mean.max()))
-    scatter = uniform_filter1d((pieces / mean).var(axis=0, ddof=1), _SMOOTHED, axis=0, mode="nearest")
+    scatter = scipy.ndimage.uniform_filter1d(
+        (pieces / mean).var(axis=0, ddof=1), _SMOOTHED, axis=0, mode="nearest"
+    )
     weight = INDEPENDENT * len(pieces) / np.maximum(scatter, 2 / m)
     of_axes, shared = [], []
     for axis, of_slopes in enumerate(np.split(power, 2, axis=2)):

@@ -6,9 +6,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.ndimage import median_filter
-from scipy.optimize import minimize
-from scipy.special import chdtri, gammainccinv, gammaincinv
+import scipy
 
 from faintspot.base.arrays import Floats
 from faintspot.loop.control.kalman.predictor import SlopeModel
@@ -191,8 +189,8 @@ class _Lines:
     def __init__(self, spectrum: Floats, spectra: ModeSpectra, rate_hz: float, slopes: int) -> None:
         self._spectrum, self._rate_hz, self._slopes = spectrum, rate_hz, slopes
         self._segments, self._bin_hz, window = spectra.segments, rate_hz / spectra.length, spectra.window
-        middle = float(gammaincinv(self._segments, 0.5)) / self._segments
-        background = median_filter(spectrum, _BACKGROUND_BINS, mode="nearest") / middle
+        middle = float(scipy.special.gammaincinv(self._segments, 0.5)) / self._segments
+        background = scipy.ndimage.median_filter(spectrum, _BACKGROUND_BINS, mode="nearest") / middle
         self._background = np.maximum(background, 1e-12 * spectrum.max() + 1e-300)
         self._correlation = np.correlate(window, window, "full")[len(window) - 1 :]
 
@@ -205,7 +203,7 @@ class _Lines:
         ratio = self._spectrum / self._background
         first = max(3, math.ceil(_LOWEST_HZ / self._bin_hz))
         ratio[:first] = ratio[-3:] = 0.0
-        limit = float(gammainccinv(self._segments, _FALSE_ALARM / len(ratio))) / self._segments
+        limit = float(scipy.special.gammainccinv(self._segments, _FALSE_ALARM / len(ratio))) / self._segments
         for _ in range(_MOST_TRIED):
             peak = int(np.argmax(ratio))
             if ratio[peak] <= limit:
@@ -241,14 +239,14 @@ class _Lines:
             shape = transform @ vibration.correlation(self._rate_hz, len(lags))
             return misfit(x[3:], vibration.rms_px**2 * self._slopes * np.maximum(shape, 0.0))
 
-        without = minimize(misfit, np.zeros(_SMOOTH_ORDER + 1)).fun
+        without = scipy.optimize.minimize(misfit, np.zeros(_SMOOTH_ORDER + 1)).fun
         strength = 4 * max(power.sum() - len(power) * self._background[peak], 1e-30) / len(lags)
         best = np.array([0.0, math.log(_START_DAMPING), math.log(strength)])
         for order in (1, _SMOOTH_ORDER):
             start, options = np.append(best, np.zeros(order)), {"maxiter": 2000, "xatol": 1e-3, "fatol": 1e-3}
-            fit = minimize(misfit_with, start, method="Nelder-Mead", options=options)
+            fit = scipy.optimize.minimize(misfit_with, start, method="Nelder-Mead", options=options)
             best = fit.x
-        if without - fit.fun < chdtri(3, _FALSE_ALARM / len(self._spectrum)) / 2:
+        if without - fit.fun < scipy.special.chdtri(3, _FALSE_ALARM / len(self._spectrum)) / 2:
             return None
         errors, vibration = _errors(misfit_with, best), line(best)
         frequency, rms = errors[0] * self._bin_hz, 0.5 * errors[2] * vibration.rms_px

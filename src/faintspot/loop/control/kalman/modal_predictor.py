@@ -9,10 +9,10 @@ from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike
 from scipy import sparse
 from scipy.linalg import solve_toeplitz
-from scipy.signal import lfilter
 
 from faintspot.base.arrays import Floats
 from faintspot.loop.control.base import CommandDelayLine, ExpectedSlopes, without_prior
@@ -208,7 +208,7 @@ def prediction_errors(arrays: Mapping[str, Floats], modes: Floats, frames: int) 
         whitening = np.append(1.0, -arrays["coefficients"][:, mode])
         surprises = np.convolve(whitening, replies[:, mode])[: order + 1]
         ahead = np.convolve(whitening, replies[frames:, mode])[:order]
-        errors[frames:, mode] -= lfilter(ahead, surprises, values)[:-frames]
+        errors[frames:, mode] -= scipy.signal.lfilter(ahead, surprises, values)[:-frames]
     return errors
 
 

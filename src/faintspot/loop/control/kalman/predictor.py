@@ -5,7 +5,7 @@ from functools import cached_property
 from typing import Self
 
 import numpy as np
-from scipy.linalg import block_diag
+import scipy
 
 from faintspot.base.arrays import Floats
 from faintspot.loop.control.reconstructor import add_noise, weighted_slopes
@@ -71,7 +71,7 @@ class SlopeModel:
         step = np.eye(2 * self.slopes, k=-self.slopes)
         blocks = np.repeat(step[None], self.layers, axis=0)
         blocks[:, : self.slopes] = self.both
-        return np.asarray(block_diag(*blocks))
+        return np.asarray(scipy.linalg.block_diag(*blocks))
 
     @cached_property
     def observation(self) -> Floats:
@@ -89,7 +89,7 @@ class SlopeModel:
         """Return the covariance (states, states) of the state's error a number of frames later."""
         driving = np.concatenate([self.driving, np.zeros_like(self.driving)])
         order = np.arange(2 * self.layers).reshape(2, -1).T.ravel()
-        added = block_diag(*driving[order])
+        added = scipy.linalg.block_diag(*driving[order])
         for _ in range(frames):
             covariance = self.onward @ covariance @ self.onward.T + added
         return covariance

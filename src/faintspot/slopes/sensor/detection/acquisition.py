@@ -9,10 +9,8 @@ import itertools
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.ndimage
+import scipy
 from numpy.typing import NDArray
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 
 from faintspot.slopes.sensor.detection.candidates import Lattice
 from faintspot.slopes.sensor.detection.nodes import REACH, SpotFlux
@@ -136,8 +134,10 @@ def _agreeing(
     first, second = links_of(neighbours).T
     alike = (matched[first] >= 0) & (matched[second] >= 0)
     alike &= np.abs(shifts[first] - shifts[second]) < tolerance_px
-    links = coo_matrix((np.ones(alike.sum()), (first[alike], second[alike])), shape=(count, count))
-    _, part = connected_components(links, directed=False)
+    links = scipy.sparse.coo_matrix(
+        (np.ones(alike.sum()), (first[alike], second[alike])), shape=(count, count)
+    )
+    _, part = scipy.sparse.csgraph.connected_components(links, directed=False)
     return np.where(part == np.bincount(part[matched >= 0], minlength=1).argmax(), matched, -1)
 
 

@@ -10,9 +10,8 @@ evidence of a node is never overruled; a column of doubtful nodes is included or
 from dataclasses import dataclass, replace
 
 import numpy as np
-import scipy.sparse
+import scipy
 from numpy.typing import NDArray
-from scipy.sparse.csgraph import breadth_first_order, connected_components, maximum_flow
 
 from faintspot.base.statistics import MAD_TO_STD
 from faintspot.slopes.sensor.detection.candidates import Lattice
@@ -263,10 +262,10 @@ def _least_cost(evidence: NDArray[np.float64], links: NDArray[np.int64], cost: f
     graph = scipy.sparse.csr_matrix(
         (np.concatenate(weights), (np.concatenate(rows), np.concatenate(columns))), shape=(count + 2,) * 2
     )
-    residual = graph - maximum_flow(graph, source, sink).flow
+    residual = graph - scipy.sparse.csgraph.maximum_flow(graph, source, sink).flow
     residual.data = np.maximum(residual.data, 0)
     residual.eliminate_zeros()
-    reached = breadth_first_order(residual, source, return_predecessors=False)
+    reached = scipy.sparse.csgraph.breadth_first_order(residual, source, return_predecessors=False)
     result = np.zeros(count + 2, dtype=bool)
     result[reached] = True
     return result[:count]
@@ -282,7 +281,7 @@ def _connected(
     graph = scipy.sparse.coo_matrix(
         (np.ones(len(joined)), (joined[:, 0], joined[:, 1])), shape=(len(illuminated),) * 2
     )
-    _, part = connected_components(graph, directed=False)
+    _, part = scipy.sparse.csgraph.connected_components(graph, directed=False)
     sizes = np.bincount(part[illuminated], minlength=part.max() + 1)
     return np.asarray(illuminated & (sizes >= max(2, _SHARE * sizes.max()))[part])
 
