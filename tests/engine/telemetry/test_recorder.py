@@ -1,9 +1,6 @@
 """The recorder: what the engine wrote is in the store, whatever ends the recording."""
 
-import errno
 import multiprocessing
-import os
-import threading
 import time
 from collections.abc import Iterator
 from multiprocessing.synchronize import Event
@@ -16,7 +13,7 @@ import pytest
 pytest.importorskip("zarr")
 
 from tests.engine.commands import needs_shared_memory, process
-from tests.engine.telemetry_cases import LAYOUT, SETTINGS, Engine, as_written, write, write_images
+from tests.engine.telemetry_cases import LAYOUT, SETTINGS, Engine, as_written, write
 from tests.patience import wait_for
 
 from faintspot.base.errors import InputError
@@ -79,30 +76,6 @@ def test_recorder_ends_after_its_time(
 
 
 @with_threads
-def test_an_engine_that_ends(engine: Engine, name: str, tmp_path: Path) -> None:
-    """All that it has left behind is in the store."""
-    recording = Recorder(name, tmp_path / "night.zarr")
-    before = recording._records.cursor
-    threading.Timer(0.3, engine.stop).start()
-    report = recording.run()
-    assert (report.ended_because, report.frames) == ("engine ended", engine.frames - before)
-    assert read_telemetry(tmp_path / "night.zarr").frame[-1] == engine.frames - 1
-
-
-@with_threads
-def test_recorder_ends_by_a_signal(
-    engine: Engine, name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(recorder, "_FLUSH_S", 0.02)
-    stop = threading.Event()
-    report = Recorder(name, tmp_path / "night.zarr").run(
-        stop=stop, progress=lambda frames: stop.set() if frames > 10 else None
-    )
-    assert report.ended_because == "stopped"
-    assert len(read_telemetry(tmp_path / "night.zarr", images=False).frame) == report.frames > 10
-
-
-@with_threads
 def test_a_slow_disk_loses_only_records(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     append = TelemetryStore.append
 
@@ -120,33 +93,6 @@ def test_a_slow_disk_loses_only_records(name: str, tmp_path: Path, monkeypatch: 
     assert as_written(vars(telemetry))
     absent = telemetry.frame[-1] - telemetry.frame[0] + 1 - report.frames
     assert 0 < absent <= report.dropped == telemetry.attributes["dropped_records"]
-
-
-@with_threads
-def test_a_full_disk(engine: Engine, name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """One line; what was written is readable; the engine goes on."""
-    import zarr
-
-    monkeypatch.setattr(recorder, "_FLUSH_S", 0.05)
-    path, resize, calls = tmp_path / "night.zarr", zarr.Array.resize, []
-
-    def full(array: Any, shape: Any) -> None:
-        calls.append(array.name)
-        if len(calls) > 40:  # amid the third or fourth time, of 12 or 15 arrays
-            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        resize(array, shape)
-
-    monkeypatch.setattr(zarr.Array, "resize", full)
-    with pytest.raises(InputError, match=r"the disk is full.*; \d+ frames are in the store") as caught:
-        Recorder(name, path).run(seconds=PATIENCE_S)
-    assert "\n" not in str(caught.value)
-    telemetry = read_telemetry(path)
-    assert f" {len(telemetry.frame)} frames" in str(caught.value)
-    assert len(telemetry.frame) > 0
-    assert as_written(vars(telemetry))
-    assert not telemetry.attributes["complete"]
-    frames = engine.frames
-    wait_for(lambda: engine.frames > frames)
 
 
 @with_threads
@@ -176,30 +122,6 @@ def test_a_recording_needs_an_engine_a_new_store_and_limits_above_zero(name: str
         for wrong in ({"n_frames": 0}, {"seconds": 0.0}):
             with pytest.raises(InputError, match=next(iter(wrong))):
                 Recorder(name, tmp_path / f"{next(iter(wrong))}.zarr").run(**wrong)
-
-
-def test_what_was_overwritten_is_counted(name: str, tmp_path: Path) -> None:
-    """Before two reads, of rings of 8 records and 3 images; one place of each may be being written to."""
-    with TelemetryRing.create(name, LAYOUT, records=8, image_slots=3) as ring:
-        recording = Recorder(name, tmp_path / "night.zarr")
-
-        def come(first: int) -> None:
-            for frame in range(first, first + 20):
-                write(ring, frame)
-                write_images(ring, frame)
-            for number in range(300):
-                ring.write_change(0, number, {"noise_std": 1.0}, None)
-
-        come(0)
-        report = recording.run(n_frames=14, progress=lambda frames: come(20) if frames == 7 else None)
-    assert (report.frames, report.dropped) == (14, 26)
-    assert (report.images, report.dropped_images) == (4, 36)
-    assert (report.changes, report.dropped_changes) == (510, 90)  # of 256 places
-    telemetry = read_telemetry(tmp_path / "night.zarr")
-    assert list(telemetry.image_frame) == [18, 19, 38, 39]
-    assert telemetry.attributes["dropped_records"] == 26
-    assert telemetry.attributes["dropped_images"] == 36
-    assert telemetry.attributes["dropped_changes"] == 90
 
 
 def test_methods_that_came_later_are_named(name: str, tmp_path: Path) -> None:
