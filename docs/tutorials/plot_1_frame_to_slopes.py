@@ -31,15 +31,7 @@ print(f"{len(layout)} sub-apertures, {layout.pitch_px:.2f} px apart, turned by {
 print(f"{len(hot)} hot pixels")
 
 # %%
-from matplotlib.patches import Rectangle
-
-figure = Figure(figsize=(7, 6.6), layout="constrained")
-axes = figure.add_subplot(xlabel="column, px", ylabel="row, px")
-shown = axes.imshow(frame, vmin=1200, vmax=2200, cmap="cividis", origin="lower")
-for row, column in layout.corners:
-    height, width = layout.window
-    axes.add_patch(Rectangle((column - 0.5, row - 0.5), width, height, fill=False, color="white", lw=0.6))
-figure.colorbar(shown, label="ADU", shrink=0.8)
+figure = layout.plot(frame).figure
 
 # %%
 # Measure
@@ -55,7 +47,7 @@ plain = fs.SlopePipeline(layout, fs.Settings("brightest", keep_brightest=30), ca
 
 slopes = denoised(frame)
 print(slopes)
-print(f"{slopes.valid.sum()} of {len(layout)} valid; rms {slopes.vector.std():.2f} px")
+figure = slopes.plot().figure
 
 # %%
 # One of the fainter sub-apertures, after every step:
@@ -78,10 +70,9 @@ for axes, (title, images) in zip(figure.subplots(1, 3), steps.items(), strict=Tr
 # Zernike modes in Noll's order, fitted to the slopes. Tip and tilt are left out of the picture; without a
 # pixel scale in the layout, the unit is that of the slopes.
 
-from faintspot.slopes.wavefront.figure import wavefront_figure
-
 wavefront = fs.fit_wavefront(slopes, layout)
-figure = wavefront_figure(wavefront, layout, "the frame").figure
+print(wavefront)
+figure = wavefront.plot(tilt=False).figure
 
 # %%
 # On the command line the same is

@@ -35,11 +35,10 @@ calibration = fs.Calibration(dark=0.0, read_noise_e=3.0)
 learnt = fs.learn_psf(frames[:300], layout, calibration)
 print(learnt)
 
-figure = Figure(figsize=(7, 3.4), layout="constrained")
+figure = Figure(figsize=(10, 4), layout="constrained")
 true = fs.PSF.analytic(**shape)
-for axes, (title, psf) in zip(figure.subplots(1, 2), {"true": true, "learnt": learnt}.items(), strict=True):
-    axes.imshow(psf.images([[0.0, 0.0]], (12, 12), 1.0)[0], cmap="cividis", origin="lower")
-    axes.set(title=title, xlabel="px", ylabel="px")
+for axes, psf in zip(figure.subplots(1, 2), (true, learnt), strict=True):
+    psf.plot(axes)
 
 # %%
 # Estimators, and how far each is from the bound

@@ -182,6 +182,12 @@ def import_modules(package: str) -> list[str]:
     return [import_module(module.name).__name__ for module in found if not module.ispkg]
 
 
+def drawn(function: str, *arguments: Any, **options: Any) -> Any:
+    """Call a function "module:name" that draws an object; it lies above the object and is imported now."""
+    module, _, name = function.partition(":")
+    return getattr(import_module(f"faintspot.{module}"), name)(*arguments, **options)
+
+
 _FILE_PACKAGES = {
     "astropy.io.fits": ("astropy", "Reading or writing a FITS file"),
     "filelock": ("filelock", "Writing slopes that can be resumed"),

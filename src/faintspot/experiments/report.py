@@ -12,7 +12,7 @@ import numpy as np
 from faintspot.base.errors import InputError
 from faintspot.base.files import derived
 from faintspot.base.report.page import FigureWithData, Report, Section, configuration_section
-from faintspot.base.report.plots import Line, Panel
+from faintspot.base.report.plots import Line, Panel, draw
 from faintspot.base.report.texts import Texts
 from faintspot.experiments.methods import knows_the_spot, label_of, style_of
 from faintspot.experiments.night.page import night_sections
@@ -233,6 +233,20 @@ def study_figures(dataset: xarray.Dataset) -> Iterator[FigureWithData]:
         figure = baselines_figure(dataset, profile)
         if figure is not None:
             yield figure
+
+
+def plot_study(dataset: xarray.Dataset, name: str | None, axes: Any) -> Any:
+    """Draw what `StudyFigures.plot` returns, with the figure's legend in its first panel."""
+    names = []
+    for figure in study_figures(dataset):
+        if name in (None, figure.name) and figure.rows:
+            places = draw(figure.rows, axes)
+            for legend in figure.figure.legends:
+                words = [text.get_text() for text in legend.get_texts()]
+                np.ravel(places)[0].legend(legend.legend_handles, words, frameon=False, fontsize="small")
+            return places
+        names.append(figure.name)
+    raise InputError(f"figure = {name!r}: expected one of {', '.join(names) or 'those of finished cells'}")
 
 
 def _cells_by_figure(dataset: xarray.Dataset) -> dict[str, list[int]]:

@@ -78,6 +78,8 @@ class FigureWithData:
     figure : matplotlib Figure
     csv : str
         Its numbers as CSV; "" for images.
+    rows : rows of Drawing
+        Its content.
     """
 
     name: str
@@ -85,6 +87,7 @@ class FigureWithData:
     caption: str
     figure: Figure
     csv: str = ""
+    rows: Sequence[Sequence[Drawing]] = ()
 
     @classmethod
     def of(
@@ -99,7 +102,7 @@ class FigureWithData:
         """Draw rows of panels, pictures and maps with options of `plot`."""
         from faintspot.base.report.plots import csv_of, plot
 
-        return cls(name, title, caption, plot(rows, height, **options), csv_of(rows))
+        return cls(name, title, caption, plot(rows, height, **options), csv_of(rows), rows)
 
     @property
     def width(self) -> int:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from faintspot.base.checks import not_none
-from faintspot.base.errors import MissingExtraError
+from faintspot.base.errors import InputError, MissingExtraError
 from faintspot.base.files import csv_text
 
 try:
@@ -335,6 +335,41 @@ class Picture:
                 axis.set_ticks(range(len(names)), names)
         if self.unit:
             colour_bar(axes, image, self.unit)
+
+
+def draw(rows: Sequence[Sequence[Drawing]], axes: Any = None) -> Any:
+    """Draw on a user's axes, in the user's style, or on new ones that pyplot shows.
+
+    Parameters
+    ----------
+    rows : rows of Drawing
+    axes : Axes or array of Axes, optional
+        One for each drawing, in their order.
+
+    Returns
+    -------
+    Axes or (n,) array of Axes
+
+    Raises
+    ------
+    InputError
+        If there is another number of axes.
+    """
+    drawings = list(chain(*rows))
+    if axes is None:
+        from matplotlib import pyplot  # which chooses how figures are shown
+
+        columns = max(map(len, rows))
+        size = 5.6 * columns + 0.8, 5.2 * len(rows)
+        _, grid = pyplot.subplots(len(rows), columns, squeeze=False, figsize=size, layout="constrained")
+        axes = [place for row, places in zip(rows, grid, strict=True) for place in places[: len(row)]]
+    places = np.asarray(axes, object).ravel()
+    if len(places) != len(drawings):
+        raise InputError(f"axes: expected {len(drawings)}, one for each drawing, got {len(places)}")
+    with matplotlib.rc_context({"image.origin": "lower", "image.cmap": COLOUR_MAP}):
+        for drawing, place in zip(drawings, places, strict=True):
+            drawing.draw(place)
+    return places if len(places) > 1 else places[0]
 
 
 def csv_of(rows: Iterable[Iterable[Drawing]]) -> str:

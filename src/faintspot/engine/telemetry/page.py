@@ -75,7 +75,7 @@ def _methods(telemetry: Telemetry) -> Iterator[tuple[str, NDArray[np.bool_]]]:
 
 
 def _slopes(telemetry: Telemetry, rows: NDArray[np.bool_]) -> Slopes:
-    names = {field.name for field in fields(Slopes)} - {"bad_pixels", "keep"}
+    names = {field.name for field in fields(Slopes) if not field.kw_only} - {"bad_pixels"}
     arrays = {name: getattr(telemetry, name)[rows] for name in names}
     return Slopes(**arrays, bad_pixels=np.zeros(arrays["x"].shape, np.int32))
 

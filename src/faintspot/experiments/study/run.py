@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from faintspot.base import __version__
-from faintspot.base.errors import InputError, MissingExtraError
+from faintspot.base.errors import InputError, MissingExtraError, drawn
 from faintspot.base.report.texts import Texts
 from faintspot.base.statistics import OUTLIER_PX
 from faintspot.experiments.running import Advance, Unit, WorkerPool, run_units
@@ -42,6 +42,43 @@ VARIABLES: dict[str, tuple[tuple[str, ...], str, str]] = {
 """Dimensions, units and description of every variable but `done`."""
 
 KIND = "study"
+
+
+@xarray.register_dataset_accessor("faintspot")  # type: ignore[no-untyped-call]
+class StudyFigures:
+    """What xarray's datasets of studies have under the name `faintspot`.
+
+    Parameters
+    ----------
+    dataset : xarray.Dataset
+        From `run` or `open_study`.
+    """
+
+    def __init__(self, dataset: xarray.Dataset) -> None:
+        self._dataset = dataset
+
+    def plot(self, figure: str | None = None, axes: Any = None) -> Any:
+        """Draw a figure of the page of `faintspot report`.
+
+        Parameters
+        ----------
+        figure : str, optional
+            Its name; default: the first one.
+        axes : array of matplotlib Axes, optional
+            As many as it has panels. Default: new ones.
+
+        Returns
+        -------
+        Axes or (n,) array of Axes
+
+        Raises
+        ------
+        InputError
+            If there is no such figure, as of a study of which no cell is finished.
+        MissingExtraError
+            If matplotlib is not installed.
+        """
+        return drawn("experiments.report:plot_study", self._dataset, figure, axes)
 
 
 def new_dataset(specification: StudySpecification) -> xarray.Dataset:

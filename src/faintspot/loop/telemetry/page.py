@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -10,11 +11,11 @@ from faintspot.base.checks import number_between
 from faintspot.base.errors import InputError
 from faintspot.base.files import csv_text
 from faintspot.base.report.page import FigureWithData, Report, Table
-from faintspot.base.report.plots import GREY, METHOD_COLOURS, WIDTH, Line, Panel, Picture
+from faintspot.base.report.plots import GREY, METHOD_COLOURS, WIDTH, Line, Panel, Picture, draw
 from faintspot.base.report.texts import Texts
 from faintspot.loop.control.identification.open_loop import FEWEST_FRAMES, R0, Measured
 from faintspot.loop.control.identification.recording import Recording
-from faintspot.loop.telemetry.report import LoopReport, Part, report_of_loop
+from faintspot.loop.telemetry.report import LoopReport, Part, noise_of_loop, report_of_loop
 
 _PARTS = ("noise", "turbulence")
 _OF_ONE = "layer "
@@ -185,10 +186,24 @@ def _time_figure(pieces: Sequence[Piece]) -> FigureWithData:
     return _TEXT.figure("time", panels, 2.6 * len(panels), legend="", shared=True)
 
 
+def plot_recording(loop: Recording, axes: Any) -> Any:
+    """Draw what `Recording.plot` returns."""
+    report = noise_of_loop(loop)
+    pictures = _noise_pictures(report)
+    if not pictures:
+        raise InputError(report.parts["noise"].missing or "cells: expected several sub-apertures, got none")
+    return draw([pictures], axes)
+
+
 def _noise_figure(report: LoopReport) -> FigureWithData | None:
     """Draw the noise of each sub-aperture along x and y."""
+    pictures = _noise_pictures(report)
+    return _TEXT.figure("noise", [pictures], 4.0, width=WIDTH * 0.7) if pictures else None
+
+
+def _noise_pictures(report: LoopReport) -> list[Picture]:
     if report.noise_px is None or report.loop.cells is None or len(report.loop.cells) == 1:
-        return None
+        return []
     cells, halves = report.loop.cells - report.loop.cells.min(axis=0), report.noise_px.reshape(2, -1)
     limits, unit = {"vmin": np.nanmin(halves), "vmax": np.nanmax(halves)}, report.loop.slope_unit
     pictures = []
@@ -196,7 +211,7 @@ def _noise_figure(report: LoopReport) -> FigureWithData | None:
         grid = np.full(cells.max(axis=0) + 1, np.nan)
         grid[tuple(cells.T)] = values
         pictures.append(Picture(grid, f"noise ({unit})", f"noise of {name}", "column", "row", limits))
-    return _TEXT.figure("noise", [pictures], 4.0, width=WIDTH * 0.7)
+    return pictures
 
 
 def _spectra_figure(report: LoopReport) -> FigureWithData | None:

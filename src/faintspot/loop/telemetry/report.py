@@ -25,7 +25,7 @@ from faintspot.loop.control.identification.open_loop import (
     site_of_loop,
     with_axes_of,
 )
-from faintspot.loop.control.identification.recording import Recording, order_doubt, prepared
+from faintspot.loop.control.identification.recording import Prepared, Recording, order_doubt, prepared
 from faintspot.loop.slope_covariance import ARCSEC
 from faintspot.loop.telemetry.spectra import (
     ModalSpectra,
@@ -136,11 +136,7 @@ def report_of_loop(
     InputError
         When the slopes do not vary, or commands and slopes are not of one loop.
     """
-    ready = prepared(replace(loop, remarks=()))  # a controller that is learnt describes itself, not the files
-    parts = {name: Part(_TEXT[f"{name}.title"]) for name in _PARTS}
-    remarks = (*loop.remarks, *ready.recording.remarks)
-    report = LoopReport(replace(ready.recording, remarks=remarks), parts)
-    report.doubts += filter(None, [order_doubt(ready.recording)])
+    ready, report = _begun(loop)
     _frames(report)
     progress("delay")
     delay = _loop(report)
@@ -157,6 +153,23 @@ def report_of_loop(
             progress("other choices")
             _choices(report, open_loop, delay)
     return report
+
+
+def noise_of_loop(loop: Recording) -> LoopReport:
+    """Return a report with the noise alone; errors are those of `report_of_loop`."""
+    _, report = _begun(loop)
+    _noise(report, _loop(report))
+    return report
+
+
+def _begun(loop: Recording) -> tuple[Prepared, LoopReport]:
+    """Return the recording in one convention, and a report on it that has no values yet."""
+    ready = prepared(replace(loop, remarks=()))  # a controller that is learnt describes itself, not the files
+    parts = {name: Part(_TEXT[f"{name}.title"]) for name in _PARTS}
+    remarks = (*loop.remarks, *ready.recording.remarks)
+    report = LoopReport(replace(ready.recording, remarks=remarks), parts)
+    report.doubts += filter(None, [order_doubt(ready.recording)])
+    return ready, report
 
 
 def _frames(report: LoopReport) -> None:

@@ -133,7 +133,7 @@ class SpotFollower:
         variables = scaled_positions(stacked, self._factor)
         if array.ndim == 2:
             variables = {name: values[0] for name, values in variables.items()}
-        return Slopes.from_variables(variables)
+        return Slopes.from_variables(variables, layout=self.pipeline.layout)
 
     def _next(self, frame: NDArray[Any], saturation: float) -> Slopes:
         """Measure the next frame, in binned pixels."""

@@ -293,14 +293,21 @@ class SmallFrames:
         Memory of the thread.
     check : function
         Sets the flags that depend on all slopes; see `SlopePipeline.flag_doubtful`.
+    layout : Layout
+        Of the results.
     """
 
     def __init__(
-        self, kernel: Direct, arguments: FrameArguments, scratch: Scratch, check: Callable[[], None]
+        self,
+        kernel: Direct,
+        arguments: FrameArguments,
+        scratch: Scratch,
+        check: Callable[[], None],
+        layout: Layout,
     ) -> None:
         self._frame = arguments.source.frames[0]
         self._slopes = [result[0] for result in arguments.slopes]
-        self._kernel, self._check = kernel, check
+        self._kernel, self._check, self._layout = kernel, check, layout
         self._arguments = arguments.measuring(0, arguments.groups, scratch)
 
     def __call__(self, frame: NDArray[np.generic]) -> Slopes:
@@ -308,4 +315,4 @@ class SmallFrames:
         np.copyto(self._frame, frame)
         self._kernel(*self._arguments)
         self._check()
-        return Slopes(*[values.copy() for values in self._slopes])
+        return Slopes(*[values.copy() for values in self._slopes], layout=self._layout)

@@ -326,7 +326,7 @@ class SlopePipeline:
         frames = np.empty((1, *self.layout.frame_shape), np.float32 if dtype.kind == "f" else np.uint16)
         arguments = self.arguments(frames, dtype)
         scratch = thread_scratch(lanes, window, plan.own_scratch)
-        return SmallFrames(plan.kernel(frames), arguments, scratch, self.check(arguments))
+        return SmallFrames(plan.kernel(frames), arguments, scratch, self.check(arguments), self.layout)
 
     def explain(self, frame: ArrayLike, prior: ArrayLike | Slopes | None = None) -> Stages:
         """Return the sub-aperture images after every step, for figures and for debugging.
@@ -387,7 +387,8 @@ class SlopePipeline:
         self.check(arguments)()
         if factor > 1:
             results = SlopeArrays(**scaled_positions(results._asdict(), factor))
-        return Slopes(*(results if array.ndim == 3 else [result[0] for result in results])), stages
+        arrays = results if array.ndim == 3 else [result[0] for result in results]
+        return Slopes(*arrays, layout=self.layout), stages
 
     def arguments(
         self,

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from faintspot.base.checks import numbers_between, one_of, real_array
-from faintspot.base.errors import InputError, MissingExtraError
+from faintspot.base.errors import InputError, MissingExtraError, drawn
 from faintspot.base.flags import NO_FLAG, UNMEASURED, VARIABLES, SubapertureFlag, are_valid, scaled_positions
 from faintspot.io.file_format import COORDINATE_UNITS, UNITS, pixels_in, unit_of
 from faintspot.io.formats.csv_files import column_name
@@ -19,6 +19,7 @@ from faintspot.slopes.sensor.layout import Layout
 if TYPE_CHECKING:
     import pandas
     import xarray
+    from matplotlib.axes import Axes
 
 
 RESULT_TYPES = tuple(map(np.dtype, ("f4", "f4", "f4", "u1", "i4", "i4", "f4", "f4", "f4")))
@@ -62,6 +63,8 @@ class Slopes:
     """Covariance of the errors of x and y [px^2]; 0 where a standard error is infinite."""
     keep: SubapertureFlag = field(default=NO_FLAG, kw_only=True)
     """Flags of `KEEPABLE` that do not make a slope invalid."""
+    layout: Layout | None = field(default=None, kw_only=True, compare=False)
+    """Layout of the sub-apertures; None of slopes that no pipeline has measured."""
 
     @property
     def valid(self) -> NDArray[np.bool_]:
@@ -87,10 +90,11 @@ class Slopes:
         variables: Mapping[str, NDArray[Any]],
         n_frames: int | None = None,
         keep: SubapertureFlag = NO_FLAG,
+        layout: Layout | None = None,
     ) -> Slopes:
         """Return the slopes from a file's variables, all frames or the first `n_frames`."""
-        arrays = {item.name: variables[item.name][:n_frames] for item in fields(cls) if item.name != "keep"}
-        return cls(**arrays, keep=keep)
+        arrays = {item.name: variables[item.name][:n_frames] for item in fields(cls) if not item.kw_only}
+        return cls(**arrays, keep=keep, layout=layout)
 
     @property
     def variables(self) -> dict[str, NDArray[np.generic]]:
@@ -112,13 +116,41 @@ class Slopes:
             ]
         return f"Slopes({', '.join(words)})"
 
+    def plot(self, axes: Axes | None = None, *, layout: Layout | None = None) -> Axes:
+        """Draw the mean slope of each sub-aperture as an arrow, as `faintspot report` does.
+
+        Arrows that are much longer than most are cut and black; crosses mark sub-apertures without a valid
+        slope.
+
+        Parameters
+        ----------
+        axes : matplotlib Axes, optional
+            Default: new ones.
+        layout : Layout, optional
+            Default: that of the pipeline.
+
+        Returns
+        -------
+        Axes
+
+        Raises
+        ------
+        InputError
+            If the layout is not known, or has another number of sub-apertures.
+        MissingExtraError
+            If matplotlib is not installed.
+        """
+        layout = self.layout if layout is None else layout
+        axes = drawn("slopes.recorded.pictures:plot_slopes", self, layout, axes)
+        return axes
+
     def to_xarray(self, layout: Layout | None = None, *, unit: str = "px") -> xarray.Dataset:
         """Return an xarray.Dataset with dimensions frame and subaperture, and units as attributes.
 
         Parameters
         ----------
         layout : Layout, optional
-            Layout of the sub-apertures, which adds centre_x, centre_y (px), row and column as coordinates.
+            Adds centre_x, centre_y (px), row and column as coordinates. Default: that of the pipeline.
         unit : {"px", "arcsec"}
             Unit of positions and standard errors; arcsec needs a layout with `pixel_scale_arcsec`.
 
@@ -129,14 +161,14 @@ class Slopes:
         MissingExtraError
             If xarray is not installed.
         """
-        return dataset_of(self.variables, layout, unit)
+        return dataset_of(self.variables, self.layout if layout is None else layout, unit)
 
     def to_pandas(self, layout: Layout | None = None, *, unit: str = "px") -> pandas.DataFrame:
         """Return a pandas.DataFrame with one row for each frame and sub-aperture, which form the index.
 
         Columns are named as in .csv files, such as x_px. Parameters and errors are those of `to_xarray`.
         """
-        return table_of_slopes(self.variables, layout, unit)
+        return table_of_slopes(self.variables, self.layout if layout is None else layout, unit)
 
 
 def reference_positions(reference: ArrayLike | Slopes | None, layout: Layout) -> NDArray[np.float64]:

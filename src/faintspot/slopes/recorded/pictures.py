@@ -1,14 +1,17 @@
 """Figures of recorded slopes: a frame after every step, followed spots, and maps over all frames."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import scipy
 from numpy.typing import NDArray
 
 from faintspot.base.arrays import Floats
+from faintspot.base.errors import InputError
 from faintspot.base.report import plots
 from faintspot.base.report.page import FigureWithData
 from faintspot.base.report.texts import Texts, plain_number
@@ -19,6 +22,9 @@ from faintspot.slopes.recorded.statistics import MeasuredSlopes
 from faintspot.slopes.sensor.drawing import Arrows, Map, asinh_stretch, map_height
 from faintspot.slopes.sensor.layout import Layout
 from faintspot.slopes.spots.sodium import SodiumProfile
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 _TEXT = Texts("faintspot.slopes.recorded")
 _MOST_MARKED = 150  # sub-apertures of the whole sensor's picture: of more, marks would hide the spots
@@ -271,6 +277,33 @@ def arrows_figure(methods: Sequence[MeasuredSlopes], layout: Layout) -> FigureWi
     Those longer than `longest_arrow` are cut to that length and drawn black.
     """
     longest, number = longest_arrow(methods)
+    maps, several = arrow_maps(methods, layout, longest), methods[0].n_frames > 1
+    values = {
+        "longest": longest,
+        "percent": _ARROWS_WHOLE_PERCENT,
+        "number": number or None,
+        "several": several,
+    }
+    figure_width = plots.WIDTH if len(maps) > 1 else 0.6 * plots.WIDTH
+    return _TEXT.figure("slopes", [maps], map_height(layout, len(maps)), values, width=figure_width)
+
+
+def plot_slopes(slopes: Slopes, layout: Layout | None, axes: Axes | None) -> Axes:
+    """Draw what `Slopes.plot` returns."""
+    if layout is None:
+        raise InputError(
+            "layout: unknown to slopes that no pipeline has measured; state it: plot(layout=...)"
+        )
+    if len(layout) != slopes.x.shape[-1]:
+        raise InputError(f"layout: expected {slopes.x.shape[-1]} sub-apertures, got {len(layout)}")
+    variables = {name: np.atleast_2d(values) for name, values in slopes.variables.items()}
+    method = MeasuredSlopes("", Slopes.from_variables(variables, keep=slopes.keep))
+    (arrows,) = arrow_maps([method], layout, longest_arrow([method])[0])
+    return plots.draw([[arrows]], axes)  # type: ignore[no-any-return]
+
+
+def arrow_maps(methods: Sequence[MeasuredSlopes], layout: Layout, longest: float) -> list[Map]:
+    """Return maps of mean slopes; arrows longer than `longest` px are cut and black."""
     pitch, several = layout.pitch_px or max(layout.window), methods[0].n_frames > 1
     length, width = (0.6, 0.004) if len(layout) <= _MOST_SHORT_ARROWS else (2.0, 0.0015)
     maps = []
@@ -281,18 +314,11 @@ def arrows_figure(methods: Sequence[MeasuredSlopes], layout: Layout) -> FigureWi
         style = {"color": colours, "scale": longest / (length * pitch), "width": width}
         cross = {"ls": "", "marker": "x", "color": plots.GREY, "ms": 5}
         arrows = Arrows(layout.centres[known], shown, style, _round_length(longest))
-        title = f"{method.name}: {'mean slope' if several else 'slope'}"
+        title = f"{method.name and f'{method.name}: '}{'mean slope' if several else 'slope'}"
         maps.append(
             Map(layout, title=title, marks=[arrows, plots.Line.of("", layout.centres[~known], cross)])
         )
-    values = {
-        "longest": longest,
-        "percent": _ARROWS_WHOLE_PERCENT,
-        "number": number or None,
-        "several": several,
-    }
-    figure_width = plots.WIDTH if len(maps) > 1 else 0.6 * plots.WIDTH
-    return _TEXT.figure("slopes", [maps], map_height(layout, len(maps)), values, width=figure_width)
+    return maps
 
 
 def longest_arrow(methods: Sequence[MeasuredSlopes]) -> tuple[float, int]:

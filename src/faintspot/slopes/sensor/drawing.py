@@ -22,6 +22,7 @@ from faintspot.base.report.plots import (
     Mark,
     Picture,
     colour_bar,
+    draw,
     limits_of,
     plot,
     png,
@@ -126,7 +127,7 @@ def map_height(layout: Layout, columns: int) -> float:
 _WINDOW, _DOUBTFUL = "#E69F00", "#56B4E9"
 _MOST_NUMBERED = 1500
 _MOST_PIXELS = 1400  # a side of the frame; of more, pixels are averaged rather than left out
-_SIDE = 12.0  # inch
+_SIDE, _NEW_SIDE = 12.0, 4.0  # inch: of the picture's file; of new axes
 
 
 def layout_picture(
@@ -159,14 +160,37 @@ def layout_picture(
     InputError
         When the frame is not of the layout's shape or the file cannot be written.
     """
+    picture = _picture(frame, layout, outside, doubtful)
+    n_rows, n_columns = picture.image.shape
+    high = min(max(0.9 * _SIDE * n_rows / n_columns, 3.0), 2 * _SIDE) + 0.9
+    figure = plot([[picture]], high, width=_SIDE, legend="")
+    write_atomically(path, png(figure, tight=False))
+
+
+def plot_layout(layout: Layout, frame: ArrayLike | None, axes: Axes | None) -> Axes:
+    """Draw what `Layout.plot` returns."""
+    if frame is None:
+        return draw([[Map(layout)]], axes)  # type: ignore[no-any-return]
+    width = _NEW_SIDE if axes is None else axes.get_window_extent().width / axes.figure.dpi
+    return draw([[_picture(frame, layout, side=width)]], axes)  # type: ignore[no-any-return]
+
+
+def _picture(
+    frame: ArrayLike,
+    layout: Layout,
+    outside: ArrayLike = (),
+    doubtful: ArrayLike | None = None,
+    side: float = 0.85 * _SIDE,
+) -> Picture:
+    """Return the picture of a layout, for axes `side` inches wide; see `layout_picture`."""
     from matplotlib import patheffects
 
     array = np.asarray(frame, dtype=np.float64)
     if array.ndim == 3:
         array = array.mean(axis=0)
-    n_rows, n_columns = array.shape
+    n_columns = array.shape[1]
     (height, width), corners = layout.window, layout.corners[:, ::-1] - 0.5
-    points = 72 * _SIDE * 0.85 * width / n_columns  # a window's width in points
+    points = 72 * side * width / n_columns  # a window's width in points
     marked = np.zeros(len(layout), bool) if doubtful is None else np.asarray(doubtful, bool)
     windows = {
         "edgecolors": np.where(marked, _DOUBTFUL, _WINDOW),
@@ -193,10 +217,7 @@ def layout_picture(
         "norm": asinh_stretch(array, layout.images(array)),
         "interpolation": "nearest" if max(array.shape) <= _MOST_PIXELS else "antialiased",
     }
-    picture = Picture(array, "frame's units", title, style=style, marks=marks)
-    high = min(max(0.9 * _SIDE * n_rows / n_columns, 3.0), 2 * _SIDE) + 0.9
-    figure = plot([[picture]], high, width=_SIDE, legend="")
-    write_atomically(path, png(figure, tight=False))
+    return Picture(array, "frame's units", title, style=style, marks=marks)
 
 
 def asinh_stretch(array: Floats, inside: Floats) -> FuncNorm:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from faintspot.base.checks import number_between, numbers_between
-from faintspot.base.errors import DoubtWarning, InputError, errors_within
+from faintspot.base.errors import DoubtWarning, InputError, drawn, errors_within
 from faintspot.base.files import check_size
 from faintspot.base.options import TEXTS, number, setting
 from faintspot.base.tables import ConfigurationTable
@@ -28,6 +28,8 @@ from faintspot.slopes.sensor.window_checks import (
 )
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
     from faintspot.slopes.sensor.windows import Windows
 
 GRID_KEYS = ("shape", "pixels", "outer_radius", "inner_radius", "pitch", "origin", "frame_shape")
@@ -160,6 +162,30 @@ class Layout(ConfigurationTable, table="layout"):
             f"<Layout: {len(self)} sub-apertures, frame_shape={self.frame_shape}, window={self.window}, "
             f"geometry={self.geometry!r}{pitch}>"
         )
+
+    def plot(self, frame: ArrayLike | None = None, axes: Axes | None = None) -> Axes:
+        """Draw the windows on a frame, as the picture of `faintspot layout`, or outlines of the lenslets.
+
+        Parameters
+        ----------
+        frame : (h, w) or (n, h, w) array, optional
+            Several are averaged.
+        axes : matplotlib Axes, optional
+            Default: new ones.
+
+        Returns
+        -------
+        Axes
+
+        Raises
+        ------
+        InputError
+            If the frame is not of the layout's shape.
+        MissingExtraError
+            If matplotlib is not installed.
+        """
+        axes = drawn("slopes.sensor.drawing:plot_layout", self, frame, axes)
+        return axes
 
     def __len__(self) -> int:
         """Return the number of sub-apertures."""

@@ -4,16 +4,19 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from faintspot.base.arrays import Floats
 from faintspot.base.checks import LARGEST_FLOAT32, number_between, numbers_between
-from faintspot.base.errors import InputError
+from faintspot.base.errors import InputError, drawn
 from faintspot.base.files import NpzFile, check_size
 from faintspot.slopes.spots.shapes import image_shape, per_spot, position_array, spots
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 _ANALYTIC_OVERSAMPLING = 8
 _LARGEST_RADIUS_PX = 128.0  # a window of the largest size needs 91 from corner to corner
@@ -135,6 +138,30 @@ class PSF(Indexed):
         size = f"{rows / self.oversampling:.3g} x {columns / self.oversampling:.3g} px"
         purpose = "" if self.index is None else f" for {len(self.index)} sub-apertures"
         return f"PSF({n} of {size}{purpose}, oversampling {self.oversampling})"
+
+    def plot(self, axes: Axes | None = None, *, which: int = 0) -> Axes:
+        """Draw a PSF: the fraction of the flux in a pixel, by its distance from the spot.
+
+        Parameters
+        ----------
+        axes : matplotlib Axes, optional
+            Default: new ones.
+        which : int
+            Index of the PSF.
+
+        Returns
+        -------
+        Axes
+
+        Raises
+        ------
+        InputError
+            If there is no such PSF.
+        MissingExtraError
+            If matplotlib is not installed.
+        """
+        axes = drawn("slopes.spots.drawing:plot_psf", self, axes, which)
+        return axes
 
     @classmethod
     def analytic(

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from faintspot.base.report.page import FigureWithData
-from faintspot.base.report.plots import GREY, METHOD_COLOURS, Drawing, Line, Panel, Picture, plot
+from faintspot.base.report.plots import GREY, METHOD_COLOURS, Drawing, Line, Panel, Picture, draw, plot
 from faintspot.slopes.sensor.drawing import Outlines
 from faintspot.slopes.sensor.layout import Layout
 from faintspot.slopes.sensor.pupil import lenslet_outlines
@@ -16,6 +16,7 @@ from faintspot.slopes.wavefront.fit import Wavefront
 from faintspot.slopes.wavefront.zernike import mode_name, osa_index
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 _MOST_OUTLINED = 1500
@@ -50,12 +51,20 @@ def wavefront_figure(
     return FigureWithData.of(file, f"Wavefront of {name}", caption, rows, 11.2, heading=name, legend=legend)
 
 
-def wavefront_map(
-    wavefront: Wavefront, layout: Layout, title: str, *, tilt: bool = True, largest: float = 0.0
-) -> Picture:
-    """Return the mean wavefront at its position in the frame, with the illuminated sub-apertures outlined.
+def plot_wavefront(wavefront: Wavefront, axes: Axes | None, *, tilt: bool) -> Axes:
+    """Draw what `Wavefront.plot` returns."""
+    several = int(np.count_nonzero(wavefront.fitted)) > 1
+    title = ("mean wavefront" if several else "wavefront") + (" without tip and tilt" if not tilt else "")
+    return draw([[wavefront_map(wavefront, None, title, tilt=tilt)]], axes)  # type: ignore[no-any-return]
 
-    Colours go to `largest` on both sides; 0: to the largest value.
+
+def wavefront_map(
+    wavefront: Wavefront, layout: Layout | None, title: str, *, tilt: bool = True, largest: float = 0.0
+) -> Picture:
+    """Return the mean wavefront at its position in the frame, with sub-apertures outlined.
+
+    Colours go to `largest` on both sides; 0: to the largest value. Without a layout, the sub-apertures are
+    those with valid slopes.
     """
     sheet, pupil, unit = wavefront.sheet(tilt=tilt), wavefront.pupil, wavefront.unit
     (x, y), radius = pupil.centre_px, pupil.radius_px
@@ -68,7 +77,9 @@ def wavefront_map(
         "extent": (x - half, x + half, y - half, y + half),
     }
     outline = {"edgecolors": "#00000030", "linewidths": 0.6}
-    lenslets = lenslet_outlines(layout) if len(layout) <= _MOST_OUTLINED else np.zeros((0, 4, 2))
+    lenslets = radius * wavefront.outlines + (x, y) if layout is None else lenslet_outlines(layout)
+    if len(lenslets) > _MOST_OUTLINED:
+        lenslets = lenslets[:0]
     angle, margin = np.linspace(0, 2 * np.pi, 200), 1.12 * radius
     circle = Line(
         "", x + radius * np.cos(angle), y + radius * np.sin(angle), style={"color": "black", "lw": 0.8}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy
@@ -10,12 +11,15 @@ from numpy.typing import NDArray
 
 from faintspot.base.arrays import Floats
 from faintspot.base.checks import not_none, number_between
-from faintspot.base.errors import InputError
+from faintspot.base.errors import InputError, drawn
 from faintspot.base.flags import SubapertureFlag, are_valid, leave_out
 from faintspot.slopes.pipeline.slopes import Slopes
 from faintspot.slopes.sensor.layout import Layout
 from faintspot.slopes.sensor.pupil import Pupil, inside_pupil, lenslet_outlines, lit_outlines, pupil_of
 from faintspot.slopes.wavefront.zernike import mean_gradients, zernike
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 NM = "nm"
 """Unit of wavefronts where the layout tells the angle of a pixel and the size of the pupil."""
@@ -31,7 +35,7 @@ _ROUNDING = 1e-9  # of lengths in radii
 _LEAST_SHARE = 0.1  # of a sub-aperture's area in the pupil, below which its slope tells too little
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, repr=False)
 class Wavefront:
     """Zernike coefficients of the wavefront in one frame or several.
 
@@ -66,6 +70,38 @@ class Wavefront:
     pupil: Pupil
     left_out: str = ""
     """Line about the slopes that were left out; empty if there are none."""
+
+    def __repr__(self) -> str:
+        """Return the numbers of modes and frames, and the rms of the mean."""
+        frames, fitted = len(self.coefficients), int(np.count_nonzero(self.fitted))
+        rms = float(np.sqrt(np.square(self.mean).sum())) if fitted else float("nan")
+        left_out = f", {self.left_out}" if self.left_out else ""
+        return (
+            f"Wavefront({len(self.modes)} modes from Z{self.modes[0]}, {fitted} of {frames} frames fitted, "
+            f"rms of the mean {rms:.4g} {self.unit}, {len(self.outlines)} sub-apertures{left_out})"
+        )
+
+    def plot(self, axes: Axes | None = None, *, tilt: bool = True) -> Axes:
+        """Draw the mean wavefront over the pupil, as `faintspot wavefront` does.
+
+        Parameters
+        ----------
+        axes : matplotlib Axes, optional
+            Default: new ones.
+        tilt : bool
+            Whether tip and tilt are shown.
+
+        Returns
+        -------
+        Axes
+
+        Raises
+        ------
+        MissingExtraError
+            If matplotlib is not installed.
+        """
+        axes = drawn("slopes.wavefront.figure:plot_wavefront", self, axes, tilt=tilt)
+        return axes
 
     @property
     def errors_from(self) -> str:

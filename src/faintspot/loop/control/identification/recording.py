@@ -20,7 +20,7 @@ from faintspot.base.checks import (
     real_array,
     strings_of,
 )
-from faintspot.base.errors import InputError
+from faintspot.base.errors import InputError, drawn
 from faintspot.base.options import Option
 from faintspot.loop.control.faults import (
     followers,
@@ -74,7 +74,7 @@ NUMBERS = {
 """Numbers that describe a recording, by name."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Recording:
     """Slopes and commands of consecutive frames of a loop; None if unknown.
 
@@ -198,6 +198,38 @@ class Recording:
         expected, shape = (slopes, self.commands.shape[1]), self.interaction_matrix.shape
         if shape != expected:
             raise InputError(f"interaction_matrix: expected shape {expected}, got {shape}")
+
+    def __repr__(self) -> str:
+        """Return the numbers of frames, slopes and commands, the rate, and how many slopes were measured."""
+        frames, slopes = self.slopes.shape
+        state, unit = "closed" if self.is_closed else "open", self.slope_unit or "unit not stated"
+        commands = "no" if self.commands is None else f"{self.commands.shape[1]}"
+        return (
+            f"Recording({self.name!r}, {state}, {frames} frames at {self.frame_rate_hz:.6g} Hz, {slopes} "
+            f"slopes ({unit}), {np.isfinite(self.slopes).mean():.1%} measured, {commands} commands)"
+        )
+
+    def plot(self, axes: Any = None) -> Any:
+        """Draw the noise of each sub-aperture's slopes, as the page of `faintspot telemetry` does.
+
+        Parameters
+        ----------
+        axes : (2,) array of matplotlib Axes, optional
+            Default: new ones.
+
+        Returns
+        -------
+        (2,) array of Axes
+            Of x and y.
+
+        Raises
+        ------
+        InputError
+            If the noise cannot be measured, or there are no cells.
+        MissingExtraError
+            If matplotlib is not installed.
+        """
+        return drawn("loop.telemetry.page:plot_recording", self, axes)
 
     def part(self, rows: slice | NDArray[np.bool_]) -> Recording:
         """Return some of the frames."""
