@@ -66,7 +66,7 @@ def test_a_recording_has_no_slopes_that_were_not_measured() -> None:
     expected = np.where(np.arange(N) == 2, np.nan, slopes).ravel()
     for given in (slopes, slopes.ravel()):
         np.testing.assert_array_equal(measured.recorded(given), expected)
-    with pytest.raises(InputError, match="slopes: expected 18 of the last frame, got 4"):
+    with refused("slopes", "18", "4"):
         measured.recorded(np.zeros(4))
 
 
@@ -113,7 +113,7 @@ def test_calibration_frames_that_say_nothing(frame: np.ndarray, message: str) ->
 def test_a_calibration_without_slopes_is_refused() -> None:
     stack = images()
     stack[2:] = 0.0
-    with pytest.raises(InputError, match=r"slopes of 9 sub-apertures, got 2; check"):
+    with refused("9 sub-apertures", "got 2"):
         tool(EVERYTHING).measure(tall(stack), noise_free=True)
 
 
@@ -208,9 +208,9 @@ def test_predictions_come_from_callables_and_objects() -> None:
     assert predicted(Predictor(), None, (4,)) is None
     assert predicted(lambda slopes: None, last, (4,)) is None
     np.testing.assert_array_equal(predicted(Predictor(), last, (2, 2)), [[0, 2], [4, 6]])
-    with pytest.raises(InputError, match=r"predict: expected slopes of shape \(6,\), got \(4,\)"):
+    with refused("predict", "(6,)", "(4,)"):
         predicted(Predictor(), last, (6,))
-    with pytest.raises(InputError, match="predict: expected a callable"):
+    with refused("predict"):
         predicted(3, last, (4,))
 
 
@@ -228,11 +228,11 @@ def test_what_a_tools_file_says(tmp_path: Path) -> None:
         assert parts.settings == Settings("window", flux_e=40.0, spot_fwhm_px=2.0)
         assert parts.calibration.dark == 3.0
         assert parts.spot == {"psf": None, "score": None}
-    with pytest.raises(InputError, match="layuot"):
+    with refused("layuot"):
         parts_of({**tables, "layuot": {}})
-    with pytest.raises(InputError, match="faintspot: calibration"):
+    with refused("faintspot: calibration"):
         parts_of({**tables, "calibration": 3})
-    with pytest.raises(InputError, match="expected a file or tables"):
+    with refused("faintspot", "int"):
         parts_of(3)  # type: ignore[arg-type]
     assert parts_of({**tables, "psf": {"profile": "gaussian", "size": 1.0}}).psf is not None
 

@@ -90,14 +90,14 @@ def test_predicted_slopes_come_by_a_stream() -> None:
     assert errors[1] < 0.3 * errors[0]
     own = measuring("map", input_streams={"predicted": "name"})
     own.maps(process(), frame, no_stream)  # whoever predicts has not begun
-    with pytest.raises(InputError, match="stream name: expected 18 slopes, got 4"):
+    with refused("stream name", "18", "4"):
         own.maps(process(), frame, lambda name: Stream(np.zeros(4)))
 
 
 def test_refused_in_one_line() -> None:
-    with pytest.raises(InputError, match=r"slopes.faintspot: expected a faintspot.toml"):
+    with refused("slopes.faintspot"):
         _Measuring({})
-    with pytest.raises(InputError, match="measure one first"):
+    with refused("slopes: no"):
         _ = measuring().tool
     with pytest.raises(AttributeError, match="no attribute 'Slopes'"):
         _ = pyrtc.Slopes
@@ -122,10 +122,10 @@ def test_maps_of_another_system(change: dict[str, Any], message: str) -> None:
 
 def test_frames_of_another_size() -> None:
     own = measuring()
-    with pytest.raises(InputError, match=r"frame: expected rows and columns, got shape \(2, 30, 30\)"):
+    with refused("frame", "(2, 30, 30)"):
         own.maps(process(), np.ones((2, 30, 30)), no_stream)
     own.maps(process(), frame_of(images()), no_stream)
-    with pytest.raises(InputError, match=r"frame: expected shape \(30, 30\) .* got \(40, 30\)"):
+    with refused("frame", "(30, 30)", "(40, 30)"):
         own.maps(process(), np.ones((40, 30)), no_stream)
 
 
@@ -240,7 +240,7 @@ def test_a_loop_with_the_predictive_filter(monkeypatch: pytest.MonkeyPatch) -> N
     monkeypatch.setattr(pyrtc, "_pyrtc", lambda: SimpleNamespace(Loop=LoopStandIn))
     signals = [np.ones(4, np.float32), None, np.ones((4, 1), np.float32)]
     loop = pyrtc.loop.__wrapped__()({"signals": signals})
-    with pytest.raises(InputError, match=r"loop\.controller: expected the file"):
+    with refused("loop.controller"):
         loop.predictive_filter()
     loop.controller = ControllerStandIn()
     for _ in signals:

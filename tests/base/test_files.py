@@ -213,7 +213,7 @@ def test_flux_beyond_the_memory_uses_the_nearest_tables(monkeypatch: pytest.Monk
 
 def test_sizes_up_to_the_limit_pass() -> None:
     check_size("frame", (1 << 14, 1 << 14))
-    with pytest.raises(fs.InputError, match="frame = 2 x 268435456: expected at most 268,435,456 numbers"):
+    with refused("frame = 2 x 268435456", "268,435,456"):
         check_size("frame", (2, MOST_NUMBERS))
 
 
@@ -222,5 +222,5 @@ class TestFilesThatClaimMore:
         zarr = pytest.importorskip("zarr")
         path = tmp_path / "frames.zarr"
         zarr.create_array(str(path), shape=(2, 1 << 17, 1 << 17), chunks=(1, 1 << 14, 1 << 14), dtype="f4")
-        with pytest.raises(fs.InputError, match="its frames = 131072 x 131072"):
+        with refused("131072 x 131072"):
             open_frames([path])

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tests.refusals import refused
 from tests.shared_data import skip_without
 
 from faintspot.base.errors import InputError
@@ -67,9 +68,9 @@ def test_open_close_flat_and_gain(sky: Sky, files: tuple[Path, Control]) -> None
     status = command({"action": "status"})["loop"]
     assert (status["state"], status["gain"], status["commands"]) == ("open", 0.5, COMMANDS)
     sky.frames(2)
-    with pytest.raises(InputError, match="gain = 3"):
+    with refused("gain = 3"):
         command({"action": "gain", "gain": 3})
-    with pytest.raises(InputError, match="action = 'shut': expected one of 'status'"):
+    with refused("action = 'shut'", "'status'"):
         command({"action": "shut"})
     command({"action": "gain", "gain": 0.25})
     closed = command({"action": "close"})["loop"]
@@ -196,7 +197,7 @@ def test_without_control_there_is_no_loop(sky: Sky, files: tuple[Path, Control])
     assert "commands" not in sky.records.dtype.names
     assert f"{sky.name}_commands" not in pyshmem.list_streams()
     other = Control(control.interaction[:-2, :40])
-    with pytest.raises(InputError, match="expected 72 rows for 36"):
+    with refused("72", "36"):
         make_engine(f"{sky.name}_other", path, other)
 
 

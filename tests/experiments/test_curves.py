@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import PchipInterpolator
 from scipy.optimize import brentq
+from tests.refusals import refused
 
 from faintspot.base.errors import InputError
 from faintspot.experiments.curves import (
@@ -159,11 +160,11 @@ def test_bad_input_is_refused() -> None:
         with pytest.raises(InputError, match=words):
             Curve.of_errors(flux, {"a": errors})
     curve, rng = exact(1 / FLUX, 1 / FLUX), np.random.default_rng(1)
-    with pytest.raises(InputError, match="methods 'reference' and 'magic'"):
+    with refused("'reference' and 'magic'"):
         gain_at_flux(curve, 80.0, rng, method="magic", reference="reference")
-    with pytest.raises(InputError, match="flux_e"):
+    with refused("flux_e"):
         gain_at_flux(curve, 0.0, rng, method="method", reference="reference")
-    with pytest.raises(InputError, match="error_px"):
+    with refused("error_px"):
         gain_at_error(curve, 0.0, rng, method="method", reference="reference")
-    with pytest.raises(InputError, match="method 'magic'"):
+    with refused("method 'magic'"):
         curve.of("magic")

@@ -243,7 +243,7 @@ def test_units_of_lost_workers_are_run_again(monkeypatch: pytest.MonkeyPatch, lo
 
 
 def test_number_of_workers_is_checked() -> None:
-    with pytest.raises(InputError, match="workers"):
+    with refused("workers"):
         WorkerPool(workers=-1)
 
 

@@ -4,9 +4,9 @@ import base64
 from pathlib import Path
 
 import pytest
+from tests.refusals import refused
 from tests.slopes.recorded.recorded_cases import Page as Reader
 
-from faintspot.base.errors import InputError
 from faintspot.base.report.page import (
     FigureWithData,
     Report,
@@ -92,5 +92,5 @@ def test_an_unknown_configuration_is_said() -> None:
 def test_the_page_is_written(tmp_path: Path) -> None:
     page().write(tmp_path / "a.html")
     assert (tmp_path / "a.html").read_text(encoding="utf-8") == page().html()
-    with pytest.raises(InputError, match="cannot be written"):
+    with refused("cannot be written"):
         page().write(tmp_path / "none" / "a.html")

@@ -7,6 +7,7 @@ from uuid import uuid4
 import pytest
 from tests.engine.commands import start
 from tests.patience import LIMIT_S, wait_for
+from tests.refusals import refused
 
 from faintspot.base.errors import InputError
 from faintspot.engine.processes.child_processes import ChildProcesses
@@ -85,5 +86,5 @@ def test_one_that_does_not_end_is_killed(tmp_path: Path, monkeypatch: pytest.Mon
 
 
 def test_a_folder_that_is_none(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="cannot be written"):
+    with refused("cannot be written"):
         ChildProcesses(tmp_path / "none").start("run", ["realtime", "run"])

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tests.refusals import refused
 
 pytest.importorskip("zarr")
 
@@ -109,15 +110,15 @@ def test_a_killed_recorder_leaves_a_whole_store(engine: Engine, name: str, tmp_p
 
 
 def test_a_recording_needs_an_engine_a_new_store_and_limits_above_zero(name: str, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="start the engine first"):
+    with refused("start the engine first"):
         Recorder(name, tmp_path / "night.zarr")
     assert not list(tmp_path.iterdir())
     with TelemetryRing.create(name, LAYOUT) as ring:
         write(ring, 0)
         (tmp_path / "there.zarr").mkdir()
-        with pytest.raises(InputError, match="already exists"):
+        with refused("already exists"):
             Recorder(name, tmp_path / "there.zarr")
-        with pytest.raises(InputError, match="cannot be written"):
+        with refused("cannot be written"):
             Recorder(name, tmp_path / "no" / "folder.zarr")
         for wrong in ({"n_frames": 0}, {"seconds": 0.0}):
             with pytest.raises(InputError, match=next(iter(wrong))):

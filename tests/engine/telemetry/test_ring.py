@@ -10,6 +10,7 @@ import pytest
 from tests.engine.commands import is_stale, needs_shared_memory, process
 from tests.engine.telemetry_cases import LAYOUT, SETTINGS, N, as_written, slopes_of, write, write_images
 from tests.patience import LIMIT_S
+from tests.refusals import refused
 
 from faintspot.base.errors import InputError
 from faintspot.engine.frames.pixel_ring import PixelRing
@@ -79,7 +80,7 @@ def test_what_is_written_is_read(name: str) -> None:
     assert is_stale(reader)
     assert as_written(reader.records.since(0)[0])  # what is there can still be read
     reader.close()
-    with pytest.raises(InputError, match="start the engine first"):
+    with refused("start the engine first"):
         TelemetryRing.attach(name)
 
 

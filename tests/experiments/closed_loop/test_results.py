@@ -57,7 +57,7 @@ def test_magnitude_is_read_as_written(tmp_path: Path) -> None:
 
 def test_other_files_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "x.npz"
-    with pytest.raises(InputError, match="no such file"):
+    with refused("no such file"):
         MagnitudeResult.load(path)
     path.write_bytes(b"nothing")
     with refused("expected a magnitude experiment"):
@@ -275,9 +275,9 @@ def test_first_values_are_among_all(name: str) -> None:
 
 
 def test_unknown_methods_and_missing_values() -> None:
-    with pytest.raises(InputError, match=r"^estimator = 'kog': expected one of 'brightest'"):
+    with refused("estimator = 'kog'", "'brightest'"):
         Method.named("kog")
-    with pytest.raises(InputError, match=r"method = 'tv.predicted': expected an estimator that takes"):
+    with refused("method = 'tv+predicted'"):
         Method.named("tv+predicted")
-    with pytest.raises(InputError, match="expected a value for 'keep_brightest' of the method 'brightest'"):
+    with refused("choice", "'keep_brightest'", "'brightest'"):
         with_choice(Method.named("brightest"), small(), {LOOP_GAIN: 0.5})

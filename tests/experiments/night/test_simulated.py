@@ -4,9 +4,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from tests.experiments.experiment_cases import HERE, StopsAfter, assert_same_files, small
+from tests.refusals import refused
 from tests.shared_data import skip_without
 
-from faintspot.base.errors import InputError
 from faintspot.experiments.night.protocol import NightPlan, load_night
 from faintspot.experiments.night.simulated import r0_of_slopes, run_night
 from faintspot.experiments.running import WorkerPool
@@ -81,7 +81,7 @@ def test_an_interrupted_night_goes_on(tmp_path: Path) -> None:
     assert not (interrupted / "night.zarr").exists()
     run_night(LOOP, interrupted, plan=PLAN, pool=HERE)
     assert_same_files(whole, interrupted)
-    with pytest.raises(InputError, match="--overwrite"):
+    with refused("--overwrite"):
         run_night(LOOP, interrupted, plan=replace(PLAN, keep_brightest=9), pool=HERE)
 
 

@@ -4,8 +4,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from tests.experiments.planner_cases import answered
+from tests.refusals import refused
 
-from faintspot import Calibration, InputError, Layout, SlopePipeline
+from faintspot import Calibration, Layout, SlopePipeline
 from faintspot.base.statistics import slope_error
 from faintspot.experiments.planner import text as answer_text
 from faintspot.experiments.planner.answer import Answer
@@ -63,7 +64,7 @@ def test_magnitudes_are_relative_without_photometry() -> None:
 
 def test_results_by_name() -> None:
     answer = answered()
-    with pytest.raises(InputError, match="'tvs': expected one that was tried: brightest, tv"):
+    with refused("'tvs'", "brightest, tv"):
         answer["tvs"]
 
 

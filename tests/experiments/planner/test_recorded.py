@@ -124,9 +124,9 @@ def test_only_so_many_frames_are_used_as_are_needed() -> None:
 
 def test_a_single_frame_does_not_tell_the_gain() -> None:
     frames, darks = recorded(2)
-    with pytest.raises(InputError, match="gain_e_per_adu"):
+    with refused("gain_e_per_adu"):
         question_from_frames(frames[0], layout=LAYOUT)
-    with pytest.raises(InputError, match="darks"):
+    with refused("darks"):
         question_from_frames(frames[0], darks[:, :10], layout=LAYOUT)
 
 

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 from tests.experiments.study_cases import cells, dataset, power_law
+from tests.refusals import refused
 
-from faintspot.base.errors import InputError
 from faintspot.experiments.curves import Curve, gain_at_error, gain_at_flux
 from faintspot.experiments.methods import TV_OVER_NO_TV
 from faintspot.experiments.study.curves import StudyConditions, study_curves
@@ -78,5 +78,5 @@ def test_without_a_curve_there_is_no_gain() -> None:
 
 
 def test_bad_input_is_refused() -> None:
-    with pytest.raises(InputError, match="mode 'worst'"):
+    with refused("mode 'worst'"):
         study_curves(dataset(cells(), power_law(gain_of)), "worst")

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
+from tests.refusals import refused
 
-from faintspot.base.errors import InputError
 from faintspot.loop.control.reconstructor import check_controllable, make_reconstructor
 
 
@@ -58,15 +58,15 @@ def test_weights_lower_the_error() -> None:
 
 
 def test_more_commands_than_slopes_are_refused() -> None:
-    with pytest.raises(InputError, match=r"41 commands .* more than 40 slopes"):
+    with refused("41 commands", "40 slopes"):
         check_controllable(41, 40)
-    with pytest.raises(InputError, match="12 commands"):
+    with refused("12 commands"):
         make_reconstructor(_matrix(10))
 
 
 @pytest.mark.parametrize("matrix", [np.zeros((4, 2)), np.ones(4), np.full((4, 2), np.nan)])
 def test_bad_matrices_are_refused(matrix: np.ndarray) -> None:
-    with pytest.raises(InputError, match="interaction"):
+    with refused("interaction"):
         make_reconstructor(matrix)
 
 

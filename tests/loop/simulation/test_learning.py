@@ -3,9 +3,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from tests.experiments.experiment_cases import small
+from tests.refusals import refused
 
 import faintspot as fs
-from faintspot.base.errors import InputError
 from faintspot.experiments.closed_loop.results import LOOP_GAIN, NOISE_SCALE, tuned_values, with_choice
 from faintspot.loop.control.base import CONTROLS, INTEGRATOR
 from faintspot.loop.control.identification.loop_delay import LoopDelay
@@ -80,11 +80,11 @@ def test_telemetry_knows_what_was_expected() -> None:
 
 
 def test_control_needs_a_closed_loop_and_the_whole_run() -> None:
-    with pytest.raises(InputError, match="expected 'integrator' in open loop"):
+    with refused("method.control = 'kalman'", "'integrator'"):
         simulate_loop(FAINT.replace("control", mode="open"), [_method("kalman")])
-    with pytest.raises(InputError, match="integrator alone"):
+    with refused("methods", "integrator"):
         simulate_loop(FAINT, [_method(), _method("kalman")], [0] * 30 + [1] * 30)
-    with pytest.raises(InputError, match=r"method.control = 'pid'"):
+    with refused("method.control = 'pid'"):
         _method("pid")
 
 
@@ -101,7 +101,7 @@ def test_the_centroid_gain_is_learnt() -> None:
     """From telemetry, within 20 % of that measured on typical spots; slopes of the run are divided by it."""
     loop = FAINT.replace("camera", photons_per_subaperture=200.0)
     method = Method("window", fixed_window(loop), control="kalman")
-    with pytest.raises(InputError, match=r"telemetry_frames = 300: too few for the centroid gain"):
+    with refused("telemetry_frames = 300"):
         simulate_loop(loop.replace("control", telemetry_frames=300), [method])
     loop = loop.replace("control", telemetry_frames=1500)
     _, learnt = learnt_control(loop, method, loop.run.seed, simulate_loop)
@@ -128,14 +128,14 @@ def test_names_of_methods_say_their_control() -> None:
     assert PRIOR not in tuned
     method = with_choice(named, FAINT, {name: each.first[0] for name, each in tuned.items()})
     assert (method.control, method.noise_scale) == ("kalman", tuned[NOISE_SCALE].first[0])
-    with pytest.raises(InputError, match=r"method 'map.lqg' = 'lqg'"):
+    with refused("method 'map+lqg' = 'lqg'"):
         Method.named("map+lqg")
-    with pytest.raises(InputError, match="expected the control once"):
+    with refused("method = 'map+kalman+weighted'"):
         Method.named("map+kalman+weighted")
 
 
 def test_assumed_winds_are_of_the_configuration() -> None:
     changed = FAINT.replace("control", winds="assumed")
     assert LoopConfiguration.from_text(changed.to_text()).control == changed.control
-    with pytest.raises(InputError, match=r"control\.winds"):
+    with refused("control.winds"):
         FAINT.replace("control", winds="guessed")

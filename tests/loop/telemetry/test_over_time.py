@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 from tests.loop.telemetry.loop_cases import AIR, RATE_HZ, recorded
+from tests.refusals import refused
 
 from faintspot.base.errors import InputError
 from faintspot.loop.control.identification.open_loop import Measured
@@ -89,7 +90,7 @@ def test_table_of_pieces() -> None:
 
 def test_pieces_that_do_not_fit() -> None:
     loop = opened(2400)
-    with pytest.raises(InputError, match=r"every_s = 0\.1: expected a number of at least"):
+    with refused("every_s = 0.1"):
         turbulence_over_time(loop, 0.1)
-    with pytest.raises(InputError, match="every_s = 1000: expected at most the recording's"):
+    with refused("every_s = 1000"):
         turbulence_over_time(loop, 1000.0)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 from tests.loop.control.control_cases import CELLS, FRAME_S, INTERACTION, telemetry
+from tests.refusals import refused
 
 from faintspot.base.errors import InputError
 from faintspot.cli.realtime import learn as realtime_learn
@@ -130,7 +131,7 @@ def test_what_is_refused() -> None:
         vars(night).update(changes)
         with pytest.raises(InputError, match=message):
             recorded_loop(night, CONTROL, LAYOUT)
-    with pytest.raises(InputError, match="expected subaperture_m or diameter_m"):
+    with refused("subaperture_m", "diameter_m"):
         site_of(LAYOUT)
 
 

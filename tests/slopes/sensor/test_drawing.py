@@ -4,10 +4,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from tests.refusals import refused
 from tests.shared_data import shared_file
 from tests.slopes.recorded.recorded_cases import sensor, simulated
 
-from faintspot.base.errors import InputError
 from faintspot.slopes.sensor.drawing import layout_picture
 from faintspot.slopes.sensor.layout import Layout
 
@@ -20,9 +20,9 @@ def test_layout_picture_is_a_png(tmp_path: Path) -> None:
     layout_picture(frames, layout, tmp_path / "layout.png")
     assert (tmp_path / "layout.png").read_bytes().startswith(b"\x89PNG")
     layout_picture(np.zeros(layout.frame_shape), layout, tmp_path / "dark.png")
-    with pytest.raises(InputError, match="frame"):
+    with refused("frame"):
         layout_picture(frames[:, 1:], layout, tmp_path / "other.png")
-    with pytest.raises(InputError, match="does not exist"):
+    with refused("does not exist"):
         layout_picture(frames, layout, tmp_path / "none" / "layout.png")
 
 

@@ -5,9 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.stats import linregress
+from tests.refusals import refused
 from tests.slopes.wavefront.test_fit import LAYOUT, SCALED, slopes_of, slopes_of_modes
 
-from faintspot import InputError, Layout, Wavefront, fit_wavefront
+from faintspot import Layout, Wavefront, fit_wavefront
 from faintspot.slopes.wavefront import certify, fit_drift
 from faintspot.slopes.wavefront.zernike import zernike
 
@@ -112,7 +113,7 @@ def test_what_is_not_known() -> None:
     assert flat.vergence_per_m.low < 0 < flat.vergence_per_m.high
     assert np.isnan(flat.radius_of_curvature_m.value)
     assert np.isfinite(certify(noisy(LAYOUT, TRUE[:, :2], 0.1, 1)).rms_without_focus.value)
-    with pytest.raises(InputError, match="wavelength_nm"):
+    with refused("wavelength_nm"):
         certify(noisy(LAYOUT, TRUE, 0.1, 1), wavelength_nm=-1.0)
 
 
@@ -167,10 +168,10 @@ def test_drift_and_its_error_are_those_of_a_line() -> None:
 
 def test_drift_of_too_few_frames_is_refused() -> None:
     wavefront = drifting(0.0, 1)
-    with pytest.raises(InputError, match="bins"):
+    with refused("bins"):
         fit_drift(wavefront, 2)
-    with pytest.raises(InputError, match="frame_rate_hz"):
+    with refused("frame_rate_hz"):
         fit_drift(wavefront, 10, frame_rate_hz=0.0)
     one = fit_wavefront(slopes_of(np.zeros((1, 2, len(LAYOUT)))), LAYOUT)
-    with pytest.raises(InputError, match="at least 6 fitted frames, got 1"):
+    with refused("6", "got 1"):
         fit_drift(one, 3)

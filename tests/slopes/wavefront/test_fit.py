@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from tests.patience import mostly_slow
+from tests.refusals import refused
 
 from faintspot import InputError, Layout, Settings, SlopePipeline, Slopes, SubapertureFlag, fit_wavefront
 from faintspot.slopes.sensor.pupil import inside_pupil, lenslet_outlines, lit_outlines, pupil_of, side_m
@@ -138,9 +139,9 @@ def test_number_of_modes_follows_the_sensor(n_side: int, expected: int) -> None:
 
 def test_too_many_modes_are_refused() -> None:
     slopes = slopes_of(np.zeros((2, 2, len(LAYOUT))))
-    with pytest.raises(InputError, match="modes = 44: 36 valid sub-apertures cannot separate so many"):
+    with refused("modes = 44", "36 valid"):
         fit_wavefront(slopes, LAYOUT, modes=44)
-    with pytest.raises(InputError, match="modes"):
+    with refused("modes"):
         fit_wavefront(slopes, LAYOUT, modes=73)
     for valid in range(3):
         dark = np.broadcast_to(np.arange(len(LAYOUT)) >= valid, (2, len(LAYOUT)))
@@ -148,7 +149,7 @@ def test_too_many_modes_are_refused() -> None:
             fit_wavefront(flagged(slopes, dark), LAYOUT)
     dark = np.arange(len(LAYOUT)) >= np.array([[2], [3]])  # of two frames
     assert fit_wavefront(flagged(slopes, dark), LAYOUT).fitted.tolist() == [False, True]
-    with pytest.raises(InputError, match="expected 35 sub-apertures, as in the layout, got 36"):
+    with refused("35 sub-apertures", "36"):
         fit_wavefront(slopes, LAYOUT[1:])
     for diameter_m in (1.5, 5.0):  # of 3 and 10 sub-apertures, where 7 have flux
         with pytest.raises(InputError, match="sub-apertures across, but those with flux"):

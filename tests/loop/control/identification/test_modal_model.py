@@ -16,6 +16,7 @@ from tests.loop.control.modal_cases import (
     wandering,
 )
 from tests.patience import try_states
+from tests.refusals import refused
 
 from faintspot.base.errors import InputError
 from faintspot.loop.control.base import CommandDelayLine
@@ -118,7 +119,7 @@ def test_slopes_that_are_not_measured(tip_tilt: PredictiveControl) -> None:
     tip_tilt.reset()
     for row in ([np.nan, np.nan], [1e9, 0.1], [0.1, -0.1]):
         assert np.isfinite(tip_tilt(row)).all()
-    with pytest.raises(InputError, match=r"slopes: expected shape \(2,\), got \(3,\)"):
+    with refused("slopes", "(2,)", "(3,)"):
         tip_tilt(np.zeros(3))
 
 

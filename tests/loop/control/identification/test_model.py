@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 from tests.loop.control.control_cases import COVARIANCES, FRAME_S, INTERACTION, PLANT, TURBULENCE, telemetry
+from tests.refusals import refused
 
 from faintspot.base.errors import InputError
 from faintspot.loop.control.base import CommandDelayLine
@@ -114,5 +115,5 @@ def test_centroid_gain_in_the_file(learnt: Kalman, tmp_path: Path) -> None:
     np.savez(path, **{name: array for name, array in arrays.items() if name != "centroid_gain"})
     assert Kalman.load(path, PLANT).centroid_gain == 1.0
     np.savez(path, **{**arrays, "centroid_gain": 0.0})
-    with pytest.raises(InputError, match="centroid_gain"):
+    with refused("centroid_gain"):
         Kalman.load(path, PLANT)

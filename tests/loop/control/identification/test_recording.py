@@ -66,7 +66,7 @@ def test_commands_that_are_held_have_no_gain() -> None:
 def test_commands_of_another_loop() -> None:
     loop = recorded()
     wrong = replace(loop, commands=np.random.default_rng(1).standard_normal(loop.commands.shape))
-    with pytest.raises(InputError, match="coherence"):
+    with refused("coherence"):
         prepared(wrong)
 
 
@@ -268,13 +268,13 @@ def test_commands_of_another_recording_and_an_uncertain_sign_are_refused() -> No
     """The same loop 1250 frames later is another recording."""
     loop = recorded()
     other = replace(loop.part(slice(0, 1300)), commands=loop.commands[1250:])
-    with pytest.raises(InputError, match="coherence"):
+    with refused("coherence"):
         prepared(other)
     rng = np.random.default_rng(2)
     forwards = np.cumsum(rng.standard_normal((2000, 36)), axis=0)
     mirror = forwards @ loop.interaction_matrix.T
     seen = np.vstack([mirror[:1], mirror[:-1]])  # a quarter of a period behind its steps at all frequencies
     quadrature = replace(loop, slopes=seen, commands=forwards, frame=None)
-    with pytest.raises(InputError, match="command_sign"):
+    with refused("command_sign"):
         prepared(quadrature)
     assert prepared(replace(quadrature, command_sign=-1)).sign == -1.0

@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from tests.loop.control.control_cases import FRAME_S, LAYERS, PLANT, TURBULENCE, telemetry
+from tests.refusals import refused
 
-from faintspot.base.errors import InputError
 from faintspot.loop.control.base import ASSUMED
 from faintspot.loop.control.identification.learning import error_of_mean, learn_controller, relearn
 from faintspot.loop.control.identification.loop_delay import LoopDelay
@@ -42,7 +42,7 @@ def test_a_filter_that_is_as_good_stays(now: Kalman) -> None:
 
 
 def test_too_few_frames_are_refused(now: Kalman) -> None:
-    with pytest.raises(InputError, match="frames to judge a filter, got 300"):
+    with refused("300"):
         relearn(PLANT, now, FRAMES.part(0, 300), TURBULENCE, RATE_HZ)
 
 
