@@ -14,7 +14,15 @@ from numpy.typing import NDArray
 from faintspot.base.errors import InputError, MissingExtraError, import_modules
 from faintspot.base.files import Closing, check_bytes, check_regular, check_size
 from faintspot.io.file_format import FileFormat
-from faintspot.io.stored_array import MOST_WHOLE_BYTES, StoredArray, arranged, one_line, split_location
+from faintspot.io.stored_array import (
+    CHANNELS,
+    MOST_WHOLE_BYTES,
+    StoredArray,
+    arranged,
+    of_colours,
+    one_line,
+    split_location,
+)
 
 import_modules("faintspot.io.formats")
 
@@ -168,14 +176,15 @@ def open_frames(
 
     FITS (plain, .gz, .fz), TIFF, PNG, BMP, JPEG, HDF5, MATLAB, .npy, .npz and Zarr stores are recognised by
     content. Each holds a cube (n, height, width) or a single frame (height, width); other axes of length one
-    are dropped. Images in colours are read if these are equal, or one of them is selected.
+    are dropped. Images and cubes in colours, (n, height, width, 3) or (n, 3, height, width), are read if the
+    colours are equal, or one is selected: "file.png:green", "file.h5:green", "file.h5:NAME:green".
 
     Parameters
     ----------
     paths : sequence of str or Path
         Files; "file.npz:key", "file.fits:EXTNAME", "file.tif:NUMBER" (a series of pages) or "store.zarr:path"
-        select one of several arrays. Default: the first image of a FITS file, all pages of a TIFF file, else
-        the array named "frames", or the only 2-D or 3-D array.
+        select one of several arrays. Default: the primary image of a FITS file, all pages of a TIFF file,
+        else the array named "frames", or the only 2-D or 3-D array.
     key : str, optional
         Array to read from every file whose name does not select one.
     time_axis : {0, 1, 2}, optional
@@ -204,7 +213,7 @@ def open_frames(
         raise InputError("frames: expected at least one file, got none")
     arrays: list[StoredArray] = []
     for path in paths:
-        array = arranged(_find_array(path, key), time_axis)
+        array = arranged(_find_array(path, key, colours=True), time_axis)
         _check_frames(array)
         if arrays and array.shape[-2:] != arrays[0].shape[-2:]:
             raise InputError(
@@ -254,9 +263,10 @@ def read_array(location: str | Path) -> NDArray[np.generic]:
         return array.read(0, array.shape[0])
 
 
-def _find_array(location: str | Path, key: str | None) -> StoredArray:
-    """Find the array in a file of any format."""
+def _find_array(location: str | Path, key: str | None, *, colours: bool = False) -> StoredArray:
+    """Find the array in a file of any format; `colours`: one channel of frames in colours."""
     path, own_key = split_location(location)
+    key = key if own_key is None else own_key
     try:
         file_format = frame_format(path)
     except OSError as error:
@@ -264,7 +274,7 @@ def _find_array(location: str | Path, key: str | None) -> StoredArray:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            array = file_format.find(path, own_key if own_key is not None else key)
+            array = _with_channel(file_format, path, key) if colours else file_format.find(path, key)
     except (InputError, MissingExtraError):
         raise
     except Exception as error:  # readers raise many kinds of errors on damaged files
@@ -272,6 +282,17 @@ def _find_array(location: str | Path, key: str | None) -> StoredArray:
     if not array.shape:
         raise InputError(f"{array.name}: expected an array, got a single number")
     return array
+
+
+def _with_channel(file_format: FileFormat, path: Path, key: str | None) -> StoredArray:
+    """Return the array `key`; if that ends in a colour and is none, this channel of the array before it."""
+    name, _, channel = ("" if key is None else key).rpartition(":")
+    try:
+        return of_colours(file_format.find(path, key), None)
+    except Exception:  # whatever a reader says of a name that is none
+        if channel not in CHANNELS:
+            raise
+    return of_colours(file_format.find(path, name or None), channel)
 
 
 def _check_frames(array: StoredArray) -> None:

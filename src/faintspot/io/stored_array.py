@@ -16,6 +16,7 @@ from faintspot.base.errors import InputError, MissingExtraError
 from faintspot.base.files import Closing, check_bytes
 
 PREFERRED_NAME = "frames"
+CHANNELS = ("red", "green", "blue")
 _MOST_LISTED = 12
 
 
@@ -33,6 +34,9 @@ def split_location(location: str | Path) -> tuple[Path, str | None]:
     before, separator, key = str(location).rpartition(":")
     if separator and key and before and _exists(Path(before)):
         return Path(before), key
+    if key in CHANNELS and ":" in before:
+        path, name = split_location(before)
+        return path, f"{name}:{key}"
     raise InputError(f"{location}: no such file or directory")
 
 
@@ -51,15 +55,21 @@ def listed(names: Iterable[str]) -> str:
     return f"{', '.join(items[:_MOST_LISTED]) or 'none'}{more}"
 
 
-def choose_name(path: Path, dimensions: Mapping[str, int], key: str | None) -> str:
+def listed_shapes(shapes: Mapping[str, tuple[int, ...]]) -> str:
+    """Return names with their shapes for a message; see `listed`."""
+    sizes = {name: " x ".join(map(str, shape)) or "a number" for name, shape in shapes.items()}
+    return listed(f"{name} ({size})" for name, size in sizes.items())
+
+
+def choose_name(path: Path, shapes: Mapping[str, tuple[int, ...]], key: str | None) -> str:
     """Return the name of the array to read: `key`, or "frames", or the only 2-D or 3-D one.
 
     Parameters
     ----------
     path : Path
         The file, for messages.
-    dimensions : mapping
-        Number of dimensions of every array in the file.
+    shapes : mapping
+        Shape of every array in the file; () of what is none.
     key : str or None
         The requested name.
 
@@ -69,17 +79,18 @@ def choose_name(path: Path, dimensions: Mapping[str, int], key: str | None) -> s
         When there is no such array, or several and none is requested.
     """
     if key is not None:
-        if key not in dimensions:
-            raise InputError(f"{path}: no array {key!r}; it contains: {listed(dimensions)}")
+        if key not in shapes:
+            raise InputError(f"{path}: no array {key!r}; it contains: {listed_shapes(shapes)}")
         return key
-    if PREFERRED_NAME in dimensions:
+    if PREFERRED_NAME in shapes:
         return PREFERRED_NAME
-    images = [name for name, count in dimensions.items() if count in (2, 3)]
-    images = images or [name for name, count in dimensions.items() if count > 3]
+    images = [name for name, shape in shapes.items() if len(shape) in (2, 3) and min(shape) > 1]
+    images = images or [name for name, shape in shapes.items() if len(shape) in (2, 3)]
+    images = images or [name for name, shape in shapes.items() if len(shape) > 3]
     if len(images) != 1:
         raise InputError(
             f"{path}: expected one array of frames, or one named 'frames'; "
-            f"it contains: {listed(dimensions)}; choose one with {path.name}:NAME"
+            f"it contains: {listed_shapes(shapes)}; choose one with {path.name}:NAME"
         )
     return images[0]
 
@@ -311,7 +322,6 @@ class _Reshaped:
         return values.reshape(part.stop - part.start, *self._shape)
 
 
-CHANNELS = ("red", "green", "blue")
 EQUAL_COLOURS = "red, green and blue are equal, and read as grey"
 """Note about such an image."""
 
@@ -339,6 +349,46 @@ def grey(name: str, values: NDArray[np.generic], *, selectable: bool = True) -> 
     return np.ascontiguousarray(first[..., 0])
 
 
+def of_colours(array: StoredArray, channel: str | None) -> StoredArray:
+    """Return one channel of frames in colours, (n, h, w, 3 or 4) or (n, 3, h, w); other arrays as they are.
+
+    Parameters
+    ----------
+    array : StoredArray
+    channel : {"red", "green", "blue"}, optional
+        Default: the colours are equal, which is found out while reading.
+
+    Raises
+    ------
+    InputError
+        If a channel is chosen of an array without colours.
+    """
+    array = _without_ones(array)
+    is_last = len(array.shape) == 4 and array.shape[-1] in (3, 4)
+    if not is_last and (len(array.shape) != 4 or array.shape[1] != 3):
+        if channel is not None:
+            raise InputError(f"{array.name}:{channel}: expected frames in colours, got shape {array.shape}")
+        return array
+    shape = array.shape[:3] if is_last else (array.shape[0], *array.shape[2:])
+
+    def open_array(files: ExitStack) -> Any:
+        return _Channel(array.name, array.opened(files), -1 if is_last else 1, channel)
+
+    name, note = (array.name, EQUAL_COLOURS) if channel is None else (f"{array.name}:{channel}", "")
+    return StoredArray(name, shape, array.dtype, open_array, note=note, matlab=array.matlab)
+
+
+class _Channel:
+    """A channel of frames in colours."""
+
+    def __init__(self, name: str, array: Any, axis: int, channel: str | None) -> None:
+        self._name, self._array, self._axis, self._channel = name, array, axis, channel
+
+    def __getitem__(self, part: slice) -> NDArray[Any]:
+        values = np.moveaxis(np.asarray(self._array[part]), self._axis, -1)
+        return grey(self._name, values) if self._channel is None else one_channel(values, self._channel)
+
+
 def one_channel(values: NDArray[np.generic], name: str) -> NDArray[np.generic]:
-    """Return the channel of this name of an image (h, w, 2 to 4)."""
-    return np.ascontiguousarray(values[..., min(CHANNELS.index(name), values.shape[-1] - 2)])
+    """Return the channel of this name of images (..., h, w, 2 to 4); those of 2 have one, and transparency."""
+    return np.ascontiguousarray(values[..., CHANNELS.index(name) if values.shape[-1] > 2 else 0])

@@ -17,7 +17,7 @@ from faintspot.io import open_frames, read_array
         (np.zeros((2, 3, 4), complex), ("dtype complex128",)),
         (np.zeros((2, 3, 4), "U3"), ("dtype <U3",)),
         (np.zeros((2, 3, 4), bool), ("dtype bool",)),
-        (np.zeros((2, 2, 3, 4)), ("(2, 2, 3, 4)",)),
+        (np.zeros((2, 2, 3, 5)), ("(2, 2, 3, 5)",)),
         (np.zeros(5), ("(5,)",)),
         (np.zeros((0, 3, 4)), ("at least one frame", "(0, 3, 4)")),
         (np.array([[None]]), ("Python objects",)),

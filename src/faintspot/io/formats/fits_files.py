@@ -29,7 +29,7 @@ from faintspot.io.file_format import (
     unit_of,
     with_absent,
 )
-from faintspot.io.stored_array import StoredArray, one_line
+from faintspot.io.stored_array import StoredArray, listed_shapes, one_line
 
 _BLOCK_BYTES, _PIECE_BYTES = 2880, 1 << 20
 
@@ -61,8 +61,9 @@ class Fits(FileFormat):
                         "detector), found none"
                     )
                 key = sensor.pixels
-        name = f"{path}:{key}" if key is not None else str(path)
         unit, column = _find_unit(path, key)
+        key = unit.name if key is None and unit.index else key
+        name = f"{path}:{key}" if key is not None else str(path)
         return _image(name, path, unit) if column is None else _column(name, path, unit, column)
 
     def names(self, path: Path) -> list[str]:
@@ -151,16 +152,16 @@ def _columns(path: Path, unit: fits_units.HeaderDataUnit) -> dict[str, fits_unit
 
 
 def _find_unit(path: Path, key: str | None) -> tuple[fits_units.HeaderDataUnit, fits_units.Column | None]:
-    """Return the first image with two axes or more, else any, or the image or column named `key`."""
-    names, line, wanted = [], None, "" if key is None else key.strip().upper()
+    """Return the primary image, the only one of two axes or more, else any; or the one or column `key`."""
+    names, images, wanted = [], list[fits_units.HeaderDataUnit](), "" if key is None else key.strip().upper()
     for unit in fits_units.units_of(path):
         columns = _columns(path, unit)
         listed = f" (a binary table; name a column, as {path.name}:COLUMN: {', '.join(columns)})"
         names.append(unit.name + (listed if columns else ""))
         if key is None and unit.shape:
-            if len(unit.shape) > 1:
+            if len(unit.shape) > 1 and not unit.index:
                 return unit, None
-            line = line or unit  # some cameras write a primary image of one number before the frames
+            images.append(unit)
         if wanted in (unit.name.upper(), str(unit.index)):
             if not unit.shape:
                 found = names[-1] if columns else "none there"
@@ -169,8 +170,14 @@ def _find_unit(path: Path, key: str | None) -> tuple[fits_units.HeaderDataUnit, 
         column = next((column for name, column in columns.items() if name.upper() == wanted), None)
         if column is not None:
             return unit, column
-    if line is not None:
-        return line, None
+    frames = [unit for unit in images if len(unit.shape) > 1]  # not the single number that some cameras write
+    if len(frames) > 1:
+        shapes = listed_shapes({unit.name: unit.shape for unit in frames})
+        raise InputError(
+            f"{path}: expected one image, it contains: {shapes}; choose one with {path.name}:NAME"
+        )
+    if images:
+        return (frames or images)[0], None
     sought = "an image" if key is None else f"an extension or a column {key!r}"
     raise InputError(f"{path}: expected {sought}, the file has only: {', '.join(names)}")
 

@@ -39,7 +39,7 @@ class Hdf5(FileFormat):
         """Return the data set at `key`, the one named `frames`, or the only one of 2 or 3 dimensions."""
         h5py = load_package("h5py")
         with h5py.File(path, "r") as file:
-            chosen = choose_name(path, _dimensions(h5py, file), None if key is None else key.strip("/"))
+            chosen = choose_name(path, _shapes(h5py, file), None if key is None else key.strip("/"))
             data_set = file[chosen]
             name, shape, chunks = f"{path}:{chosen}", data_set.shape, data_set.chunks
             compressions = _check(name, data_set)
@@ -63,16 +63,16 @@ class Matlab73(Hdf5):
     matlab = True
 
 
-def _dimensions(h5py: Any, file: Any) -> dict[str, int]:
-    """Return the number of dimensions of each data set by its path; links are not followed."""
-    dimensions: dict[str, int] = {}
+def _shapes(h5py: Any, file: Any) -> dict[str, tuple[int, ...]]:
+    """Return the shape of each data set by its path; links are not followed."""
+    shapes: dict[str, tuple[int, ...]] = {}
 
     def visit(name: str, item: object) -> None:
         if isinstance(item, h5py.Dataset) and not name.startswith("#"):  # MATLAB's internal data
-            dimensions[name] = len(item.shape or ())
+            shapes[name] = item.shape or ()
 
     file.visititems(visit)
-    return dimensions
+    return shapes
 
 
 def _check(name: str, data_set: Any) -> int:
@@ -148,12 +148,12 @@ class Matlab(FileFormat):
         import scipy.io  # slow import: a tenth of a second
 
         variables = {name: (shape, kind) for name, shape, kind in scipy.io.whosmat(path)}
-        dimensions = {
-            name: len(shape) if max(shape, default=0) > 1 else 0  # MATLAB stores numbers as 1 x 1 arrays
+        shapes = {
+            name: shape if max(shape, default=0) > 1 else ()  # MATLAB stores numbers as 1 x 1 arrays
             for name, (shape, kind) in variables.items()
             if kind in _TYPES
         }
-        chosen = choose_name(path, dimensions, key)
+        chosen = choose_name(path, shapes, key)
         shape, kind = variables[chosen]
 
         def load() -> NDArray[Any]:
@@ -179,7 +179,7 @@ class Idl(FileFormat):
         """Return the variable or field `key`, in which capitals do not count."""
         arrays = saved_arrays(path)
         wanted = None if key is None else key.strip().upper()
-        chosen = choose_name(path, {name: array.ndim for name, array in arrays.items()}, wanted)
+        chosen = choose_name(path, {name: array.shape for name, array in arrays.items()}, wanted)
         array = arrays[chosen]
         return StoredArray.whole(f"{path}:{chosen}", array.shape, array.dtype, lambda: array)
 

@@ -78,8 +78,8 @@ class Npz(FileFormat):
             for name in chosen:
                 with archive.open(members[name]) as stream:
                     headers[name] = _Header.read(f"{path}:{name}", stream)
-        dimensions = {name: len(headers[name].shape) if name in headers else 0 for name in members}
-        name = choose_name(path, dimensions, key)
+        shapes = {name: headers[name].shape if name in headers else () for name in members}
+        name = choose_name(path, shapes, key)
         member, header = members[name], headers[name]
         if header.fortran_order and len(header.shape) > 2:
             raise InputError(

@@ -240,7 +240,7 @@ class Zarr(FileFormat):
         node: Any = open_store(path, key or "")
         if isinstance(node, zarr.Group):
             arrays = dict(node.arrays())
-            node = arrays[choose_name(path, {name: array.ndim for name, array in arrays.items()}, None)]
+            node = arrays[choose_name(path, {name: array.shape for name, array in arrays.items()}, None)]
         name = f"{path}:{node.path}" if node.path else str(path)
         options: dict[str, Any] = {"chunks": node.chunks, "compressions": check_array(name, node)}
         chunks = CheckedChunks(name, path / node.path, node)
