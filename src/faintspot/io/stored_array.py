@@ -390,5 +390,5 @@ class _Channel:
 
 
 def one_channel(values: NDArray[np.generic], name: str) -> NDArray[np.generic]:
-    """Return the channel of this name of images (..., h, w, 2 to 4); those of 2 have one, and transparency."""
+    """Return a channel of images (..., h, w, 2 to 4); those of 2 have one, and transparency."""
     return np.ascontiguousarray(values[..., CHANNELS.index(name) if values.shape[-1] > 2 else 0])
