@@ -85,9 +85,10 @@ class TestAgainstOracle:
         assert_equals_oracle(case, case.measure())
 
     @pytest.mark.slow
-    # Each is compiled anew: one of each family; `make fuzz` compares every estimator at every width.
+    # Each is compiled anew: one of each family; `make fuzz` compares every estimator at every width, and
+    # test_total_variation.py the solver.
     @pytest.mark.parametrize("width", [8, 16])
-    @pytest.mark.parametrize("estimator", ["tv", "window", "ml"])
+    @pytest.mark.parametrize("estimator", ["brightest", "window", "ml"])
     def test_any_simd_width(self, estimator: str, width: int) -> None:
         case = random_case(width, estimator, n=7)
         assert assert_equals_oracle(case, case.measure(width=width)) > 2
@@ -211,8 +212,10 @@ class TestNoiseMap:
         pipeline, expected = case.pipeline(), case.measure()
         frame = case.images.reshape(-1, case.images.shape[2])
         calibrated = pipeline.explain(frame).calibrated.reshape(frame.shape)
-        narrow = pipeline.with_width(4)(frame, case.prior)
-        for found in (narrow, pipeline.for_images()(calibrated, case.prior)):
+        measured = [pipeline.for_images()(calibrated, case.prior)]
+        if estimator == "weighted":  # which compiles faster
+            measured.append(pipeline.with_width(4)(frame, case.prior))
+        for found in measured:
             for name in ("x", "y", "standard_error_x"):
                 values = getattr(expected, name)
                 np.testing.assert_allclose(getattr(found, name), values, rtol=1e-4, atol=1e-4, err_msg=name)

@@ -7,9 +7,7 @@ from faintspot.experiments.closed_loop.search import Search
 from faintspot.experiments.running import WorkerPool
 from faintspot.loop.simulation.configuration import LoopConfiguration
 
-SEARCH = Search(
-    coarse_frames=30, frames=40, settle_frames=10, realisations=1, finalists=2, climbs=1, rounds=1
-)
+SEARCH = Search(coarse_frames=20, frames=25, settle_frames=8, realisations=1, finalists=2, climbs=1, rounds=1)
 HERE = WorkerPool(workers=0)
 
 

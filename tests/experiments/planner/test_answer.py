@@ -4,6 +4,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from tests.experiments.planner_cases import answered
+from tests.patience import mostly_slow
 from tests.refusals import refused
 
 from faintspot import Calibration, Layout, SlopePipeline
@@ -22,7 +23,7 @@ def with_layout(answer: Answer, name: str) -> Answer:
     return dataclasses.replace(answer, question=question, equal=(name,))
 
 
-@pytest.mark.parametrize("name", list(estimators()))
+@pytest.mark.parametrize("name", mostly_slow(4, estimators()))
 def test_the_configuration_gives_the_error_that_was_promised(name: str, tmp_path: Path) -> None:
     answer = with_layout(answered(), name)
     answer.save(tmp_path / "faintspot.toml")

@@ -20,7 +20,7 @@ from faintspot.loop.telemetry.choices import AS_RUN, BEST, FILTER
 from faintspot.loop.telemetry.page import page_of_loop
 from faintspot.loop.telemetry.report import LoopReport, Part, _noise, _vibrations, report_of_loop
 
-FRAMES = 1700
+FRAMES = 1300
 
 
 @pytest.fixture(scope="module")

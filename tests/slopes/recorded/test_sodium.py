@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 from tests.cli.cli_cases import Commands
+from tests.patience import mostly_slow
 
 import faintspot as fs
 from faintspot.base.errors import InputError
@@ -112,8 +113,8 @@ def test_sodium_command_writes_what_the_pipeline_knows(recording: Path, run: Com
     run.ok("slopes", recording / "frames.npy", "-c", path, "-o", slopes)
 
 
+@pytest.mark.parametrize("noise", mostly_slow(1, [3.0, 0.43, 0.0]))
 @pytest.mark.parametrize("level", [0.0, 7.0, 65535.0])
-@pytest.mark.parametrize("noise", [0.0, 0.43, 3.0])
 def test_frames_without_spots_are_refused(tmp_path: Path, level: float, noise: float) -> None:
     rng = np.random.default_rng(3)
     np.save(tmp_path / "none.npy", level + noise * rng.standard_normal((20, *LAYOUT.frame_shape)))
