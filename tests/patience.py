@@ -5,7 +5,7 @@ from collections.abc import Iterable
 from typing import Any
 
 import pytest
-from hypothesis import settings
+from hypothesis import Phase, settings
 from hypothesis.stateful import RuleBasedStateMachine, run_state_machine_as_test
 
 LIMIT_S = 60.0
@@ -21,8 +21,14 @@ def examples(count: int) -> settings:
 
 
 def try_states(machine: type[RuleBasedStateMachine], count: int, steps: int) -> None:
-    """Run a state machine `count` times as for `examples`, with at most so many steps."""
-    run_state_machine_as_test(machine, settings=settings(examples(count), stateful_step_count=steps))
+    """Run a state machine `count` times as for `examples`, with at most so many steps.
+
+    The steps to a failure are not shortened, which would take minutes.
+    """
+    phases = (Phase.explicit, Phase.reuse, Phase.generate)
+    run_state_machine_as_test(
+        machine, settings=settings(examples(count), stateful_step_count=steps, phases=phases)
+    )
 
 
 def wait_for(condition: Any, what: object = "", step: Any = lambda: time.sleep(0.001)) -> None:

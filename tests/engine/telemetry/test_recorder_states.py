@@ -86,6 +86,11 @@ class Recording(threading.Thread):
         self._orders.put(order)
         self.rest()
 
+    def end(self) -> None:
+        """End it wherever it is."""
+        self._orders.put("end")
+        self.join(LIMIT_S)
+
     def rest(self) -> None:
         """Wait until it waits."""
         assert self._ready.acquire(timeout=LIMIT_S)
@@ -272,7 +277,7 @@ class Recordings(RuleBasedStateMachine):
 
     def teardown(self) -> None:
         if self.recording is not None:
-            self.recording.go_on("end")
+            self.recording.end()
         if hasattr(self, "folder"):
             self.ring.close()
             shutil.rmtree(self.folder)
