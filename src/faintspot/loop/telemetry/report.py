@@ -21,11 +21,18 @@ from faintspot.loop.control.identification.open_loop import (
     Measured,
     OpenLoop,
     known_delay,
+    measured_delay,
     open_loop_of,
     site_of_loop,
     with_axes_of,
 )
-from faintspot.loop.control.identification.recording import Prepared, Recording, order_doubt, prepared
+from faintspot.loop.control.identification.recording import (
+    Prepared,
+    Recording,
+    gains_of_pieces,
+    order_doubt,
+    prepared,
+)
 from faintspot.loop.slope_covariance import ARCSEC
 from faintspot.loop.telemetry.spectra import (
     ModalSpectra,
@@ -46,6 +53,8 @@ _PARTS = ("frames", "loop", "noise", "turbulence", "vibrations", "spectra", "cho
 _OF_TURBULENCE = _PARTS[3:]
 _TIMES_AT_LIMIT = 3  # that a largest value occurs, to be taken for a limit
 _MOST_UNMEASURED = 0.2  # of the slopes; large ones are missed most, so that the others vary too little
+_LEAST_GAIN = 0.5  # of the usual one, with which commands follow slopes in a piece
+_SURE_ERRORS, _CHANGED = 3.0, 0.5  # standard errors, and frames, by which delays of halves differ
 _INDISTINCT = 0.5  # relative error of the noise, from which it may be turbulence
 
 
@@ -137,7 +146,6 @@ def report_of_loop(
         When the slopes do not vary, or commands and slopes are not of one loop.
     """
     ready, report = _begun(loop)
-    _frames(report)
     progress("delay")
     delay = _loop(report)
     progress("noise")
@@ -163,12 +171,13 @@ def noise_of_loop(loop: Recording) -> LoopReport:
 
 
 def _begun(loop: Recording) -> tuple[Prepared, LoopReport]:
-    """Return the recording in one convention, and a report on it that has no values yet."""
+    """Return the recording in one convention, and a report on its frames."""
     ready = prepared(replace(loop, remarks=()))  # a controller that is learnt describes itself, not the files
     parts = {name: Part(_TEXT[f"{name}.title"]) for name in _PARTS}
     remarks = (*loop.remarks, *ready.recording.remarks)
     report = LoopReport(replace(ready.recording, remarks=remarks), parts)
     report.doubts += filter(None, [order_doubt(ready.recording)])
+    _frames(report)
     return ready, report
 
 
@@ -219,6 +228,7 @@ def _delay(report: LoopReport) -> tuple[list[Measured], LoopDelay]:
         report.doubts.append(_TEXT["doubts.delay"])
         remarks = f"{unknown}; {used.delay_frames:g} is used", f"{unknown}; 1 is used"
         return [Measured(*name, remark=text) for name, text in zip(names, remarks, strict=True)], used
+    report.doubts += _changes(fitted, used)
     remark = "given" if assumed is not None else f"{used.delay_frames:g} is used" if used is not fit else ""
     if not in_modes:
         used = with_axes_of(loop, used)
@@ -229,6 +239,24 @@ def _delay(report: LoopReport) -> tuple[list[Measured], LoopDelay]:
     of_axes = used.measured_x_to_y, used.x_to_y_error
     axes = Measured("centroid gain of x relative to y", "", *of_axes, f"{used.x_to_y:.3g} is used")
     return [Measured(*names[0], fit.delay_frames, fit.delay_error, remark), gain, axes], used
+
+
+def _changes(loop: Recording, delay: LoopDelay) -> list[str]:
+    """Return doubts whether one loop ran during the whole recording: its law, and its delay."""
+    gains = gains_of_pieces(loop)
+    if len(gains) and not (gains > _LEAST_GAIN).all():
+        return [_TEXT("doubts.law", least=float(gains.min()), most=float(gains.max()))]
+    middle, halves = len(loop.frame) // 2, list[LoopDelay]()
+    for rows in (slice(middle), slice(middle, None)):
+        with suppress(InputError):  # of half of the frames it may not be known
+            halves.append(measured_delay(replace(loop.part(rows), delay_frames=None))[0])
+    if len(halves) < 2:
+        return []
+    first, second = halves
+    error = math.hypot(first.delay_error, second.delay_error)
+    if not abs(first.delay_frames - second.delay_frames) > max(_SURE_ERRORS * error, _CHANGED):
+        return []
+    return [_TEXT("doubts.delays", first=first.delay_frames, second=second.delay_frames)]
 
 
 def _saturated(loop: Recording) -> Measured:

@@ -38,6 +38,7 @@ _UNRELATED = 0.1  # coherence below which commands are not those of the loop
 _WINDOW, _SLOW, _INDEPENDENT = 64, 16, 0.75  # frames; part of them; part of half-overlapping pieces
 _IN_PHASE, _MOST_COMPARED = 0.4, 200  # part that tells the sign; slopes
 _STEPS_FOR_TEST = 200  # fewest of them
+_PIECES, _AT_ONCE = 8, 0  # in which commands are to follow slopes alike; lag of a prepared recording
 _PER_FRAME = ("slopes", "commands", "frame", "standard_errors", "covariance_xy")
 OFFSETS = "reference_slopes", "flat_command"
 _ARRAYS = (
@@ -575,7 +576,9 @@ def _coherence(controlled: Floats, caused: Floats) -> tuple[float, float]:
     return float(np.square(np.abs(coherency)).mean()) - 1 / (_INDEPENDENT * pieces), in_phase
 
 
-def _steps_on_slopes(controlled: Floats, caused: Floats, frame: NDArray[np.int64]) -> tuple[Floats, Floats]:
+def _steps_on_slopes(
+    controlled: Floats, caused: Floats, frame: NDArray[np.int64], most_lag: int = _MOST_SENT_AFTER
+) -> tuple[Floats, Floats]:
     """Return correlations of slopes with steps of the commands 0, 1, ... rows later, and regressions.
 
     Steps are regressed on the command before, too, as a leak takes a part of it.
@@ -585,13 +588,35 @@ def _steps_on_slopes(controlled: Floats, caused: Floats, frame: NDArray[np.int64
     is_first = np.diff(frame, prepend=frame[0] - 1) != 1
     steps[is_first] = before[is_first] = 0.0
     correlations, regressions = [], []
-    for lag in range(_MOST_SENT_AFTER + 1):
+    for lag in range(most_lag + 1):
         one, other, held = controlled[: len(controlled) - lag], steps[lag:], before[lag:]
         sizes = math.sqrt(float((one * one).sum()) * float((other * other).sum()))
         correlations.append(float((one * other).sum()) / max(sizes, 1e-300))
         both = np.stack([one.ravel(), held.ravel()])
         regressions.append(float((np.linalg.pinv(both @ both.T) @ (both @ other.ravel()))[0]))
     return np.array(correlations), np.array(regressions)
+
+
+def gains_of_pieces(loop: Recording) -> Floats:
+    """Return how commands follow slopes in pieces of a prepared recording, in the usual gain, (pieces, axes).
+
+    Axes are x and y, or all slopes without cells. An integrator follows alike in all; no pieces where the
+    commands are not those of an integrator.
+    """
+    loop = loop.part(np.isfinite(loop.slopes).any(axis=1))
+    controlled, caused = _controlled(loop)
+    axes = np.array_split(np.arange(controlled.shape[1]), 1 if loop.cells is None else 2)
+    gains, correlations = [], []
+    for rows in np.array_split(np.arange(len(loop.frame)), _PIECES):
+        for columns in axes:
+            part = np.ix_(rows, columns)
+            correlation, gain = _steps_on_slopes(controlled[part], caused[part], loop.frame[rows], _AT_ONCE)
+            correlations.append(abs(float(correlation[0])))
+            gains.append(float(gain[0]))
+    usual = float(np.median(gains))
+    if len(loop.frame) < _PIECES * _WINDOW or np.median(correlations) < _CLEAR or not usual:
+        return np.zeros((0, len(axes)))
+    return np.reshape(gains, (_PIECES, len(axes))) / usual
 
 
 def rows_of_slopes(slopes: Floats) -> Floats:
