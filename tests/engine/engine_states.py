@@ -197,11 +197,11 @@ class Engines(RuleBasedStateMachine):
             self.go_on(True)
 
     @precondition(lambda self: self.engine is not None and self.ring is not None)
-    @rule(kinds=SEVERAL, step=STEPS, short=st.integers(0, 3))
+    @rule(kinds=SEVERAL, step=STEPS, short=st.sampled_from([0, 2, 3, 4]))
     def frames_at_once(self, kinds: list[str], step: int, short: int) -> None:
-        """Let more frames come than the ring holds, one of which ends before its last row."""
+        """Let more frames come than the ring holds; the last but few may end before its last row."""
         for index, kind in enumerate(kinds):
-            self.publish(kind, step, is_short=index == short and index < len(kinds) - 1)
+            self.publish(kind, step, is_short=len(kinds) - index == short)
         self.model.measure_all()
         self.go_on(True)
 

@@ -64,3 +64,9 @@ def test_an_estimator_that_is_unloaded_takes_no_turns(engines: Engines) -> None:
     engines.set_values("keep_brightest", 7, None)
     engines.frames(["spots 0"], 1)
     engines.it_is_as_the_model()
+
+
+def test_a_frame_that_ends_early_is_lost_alone(engines: Engines) -> None:
+    engines.frames_at_once(["spots 0", "spots 1", "spots 2"], 1, 2)
+    engines.it_is_as_the_model()
+    assert (engines.model.counters.processed, engines.model.counters.short) == (2, 1)

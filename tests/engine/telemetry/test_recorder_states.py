@@ -30,7 +30,7 @@ from faintspot.engine.telemetry.recorder import Recorder
 from faintspot.engine.telemetry.ring import CHANGE_SLOTS, TelemetryRing
 from faintspot.io import read_telemetry
 
-RECORDS, IMAGES = 8, 3
+RECORDS, IMAGES = 8, 7
 """Places in the rings."""
 LIMITS = st.none() | st.integers(1, 60)
 """Numbers of frames after which a recording ends."""
