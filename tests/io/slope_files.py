@@ -63,7 +63,15 @@ def write(path: Path, whole: Mapping[str, NDArray[Any]], step: int = 8, **change
     n_frames, n_subapertures = whole["x"].shape
     with writer_for(path, n_frames, n_subapertures, **changes) as writer:
         for start in range(writer.finished(), n_frames, step):
-            writer.append(start, part(whole, start, min(start + step, n_frames)))
+            append_copy(writer, start, part(whole, start, min(start + step, n_frames)))
+
+
+def append_copy(writer: SlopeWriter, start: int, block: Mapping[str, NDArray[Any]]) -> None:
+    """Append a block in arrays that are then used again, as who measures may do."""
+    copies = {name: values.copy() for name, values in block.items()}
+    writer.append(start, copies)
+    for values in copies.values():
+        values[:] = 0
 
 
 def begin(path: Path, n_frames: int, **changes: Any) -> None:
