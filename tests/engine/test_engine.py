@@ -13,6 +13,7 @@ import pytest
 from rich.console import Console
 from tests.engine.bench import SETTINGS, Bench, make, simulated
 from tests.patience import LIMIT_S
+from tests.refusals import refused
 
 import faintspot as fs
 from faintspot.cli.realtime import control as realtime_control
@@ -108,7 +109,7 @@ def test_frames_of_a_ring_that_was_waited_for_count(bench: Bench, monkeypatch: p
 
 
 def test_a_living_publisher_is_not_replaced(bench: Bench) -> None:
-    with pytest.raises(fs.InputError, match="a living process publishes under this name"):
+    with refused(bench.name):
         Engine(bench.name, make, SETTINGS)
 
 

@@ -195,7 +195,7 @@ def test_wrong_use_by_the_writer(name: str) -> None:
         ring.begin()
         ring.rows_ready(8)
         for rows in (7, SHAPE[0] + 1):
-            with pytest.raises(InputError, match=f"rows = {rows}: expected 8 to 24"):
+            with refused(f"rows = {rows}", "8 to 24"):
                 ring.rows_ready(rows)
         reader = PixelRing.attach(name)
         with refused("pixel ring", "creator"):
@@ -233,7 +233,7 @@ def test_only_the_same_user_can_open_it(name: str) -> None:
 def test_a_second_writer_is_refused(name: str) -> None:
     with PixelRing.create(name, SHAPE, np.float32) as ring:
         ring.publish(np.full(SHAPE, 3.0))
-        with refused(match=f"process {os.getpid()} already writes"):
+        with refused(f"process {os.getpid()}"):
             PixelRing.create(name, (8, 8), np.uint16)
         np.testing.assert_array_equal(PixelRing.attach(name).slot(0), 3.0)
         assert not is_stale(ring)
@@ -254,7 +254,7 @@ def killed_writer(name: str) -> Iterator[None]:
         ring = attached(name)
         wait_for(lambda: ring.last_row_time_ns(0) > 0)
         assert not is_stale(ring)
-        with pytest.raises(InputError, match=f"process {writer.pid} already writes"):
+        with refused(f"process {writer.pid}"):
             PixelRing.create(name, SHAPE, np.float32)
         writer.kill()
         wait_for(lambda: is_stale(ring))

@@ -14,7 +14,6 @@ from tests.engine.commands import needs_shared_memory
 from tests.patience import wait_for
 from tests.refusals import refused
 
-from faintspot.base.errors import InputError
 from faintspot.engine.frames.pixel_ring import PixelRing
 from faintspot.engine.streams import bridge as bridge_module
 from faintspot.engine.streams.bridge import BridgeCounters, StreamBridge
@@ -217,7 +216,7 @@ def test_a_producer_that_dies_while_it_writes(name: str, running: Running) -> No
 
 def test_the_ring_belongs_to_somebody_else(name: str) -> None:
     stream = created(name)
-    with PixelRing.create(name, SHAPE, np.uint16), pytest.raises(InputError, match="writes into this"):
+    with PixelRing.create(name, SHAPE, np.uint16), refused(name):
         StreamBridge(f"{name}_in", name).run()
     stream.unlink()
     with refused("n_frames = 0"):

@@ -12,7 +12,6 @@ from tests.engine.telemetry_cases import LAYOUT, SETTINGS, N, as_written, slopes
 from tests.patience import LIMIT_S
 from tests.refusals import refused
 
-from faintspot.base.errors import InputError
 from faintspot.engine.frames.pixel_ring import PixelRing
 from faintspot.engine.processes.segment import FOLDER
 from faintspot.engine.telemetry.ring import TelemetryRing
@@ -169,9 +168,9 @@ def test_nothing_is_torn_between_processes(name: str) -> None:
 def test_what_is_not_telemetry_is_refused(name: str, tmp_path: Path) -> None:
     with (
         PixelRing.create(f"{name}_telemetry", (4, 4), np.uint8),
-        pytest.raises(InputError, match="expected a ring of telemetry, got a pixel ring"),
+        refused("ring of telemetry", "pixel ring"),
     ):
         TelemetryRing.attach(name)
     for wrong in ({"records": 1}, {"records": 1e9}, {"image_slots": 0}):
-        with pytest.raises(InputError, match=next(iter(wrong))):
+        with refused(*wrong):
             TelemetryRing.create(name, LAYOUT, **wrong)

@@ -7,7 +7,6 @@ from tests.loop.simulation.loop_cases import faint, plain
 from tests.refusals import refused
 from tests.shared_data import skip_without
 
-from faintspot.base.errors import InputError
 from faintspot.loop.simulation import LoopRecord, simulate_loop
 
 skip_without("hcipy")
@@ -44,11 +43,11 @@ def test_files_that_are_no_records_are_refused(tmp_path: Path) -> None:
         LoopRecord.load(tmp_path / "none.npz")
     text = tmp_path / "text.npz"
     text.write_text("hello")
-    with pytest.raises(InputError, match="expected a record of a loop"):
+    with refused(".npz"):
         LoopRecord.load(text)
     other = tmp_path / "other.npz"
     np.savez(other, a=1)
-    with pytest.raises(InputError, match="expected a record of a loop"):
+    with refused(".npz"):
         LoopRecord.load(other)
 
 
