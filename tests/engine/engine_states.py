@@ -5,6 +5,7 @@ import tempfile
 import threading
 from collections.abc import Callable
 from dataclasses import asdict, replace
+from functools import cache
 from pathlib import Path
 from typing import Any, cast
 from uuid import uuid4
@@ -40,15 +41,9 @@ CONTROL = Control(
     ControlOptions(guard_frames=4, proven_frames=6, most_invalid=0.4),
 )
 BODY = f"if {BRIGHT / 2} < images.max() < {BRIGHT}:\n    raise ValueError('bright')\n{PEAK}"
-FRAMES = {f"spots {number}": frame for number, frame in enumerate(simulated(3))}
-FRAMES["bright"] = FRAMES["spots 0"].copy()
-FRAMES["bright"][3, 3] = BRIGHT
-FRAMES["dark"] = np.full_like(FRAMES["bright"], 100)
+SPOTS = "spots 0", "spots 1", "spots 2"
 BAD = {"not finite": [np.nan, np.inf, -np.inf], "absurd": [3e38, -3e38, 1e-40]}
-FRAMES |= {name: FRAMES["spots 1"].astype(np.float32) for name in BAD}
-for name, values in BAD.items():
-    FRAMES[name][:9:4, :20] = np.array(values)[:, None]
-KINDS = st.sampled_from([*FRAMES, "bright", "bright", "dark"])
+KINDS = st.sampled_from([*SPOTS, *BAD, *3 * ["bright"], *2 * ["dark"]])
 SEVERAL = st.lists(KINDS, min_size=2, max_size=7) | KINDS.map(lambda kind: 7 * [kind])
 DTYPES = st.sampled_from([np.uint16, np.float32])
 STEPS = st.sampled_from([1, 1, 1, 1, 2, 0, -3, 1000, 2_000_000, 2**62])
@@ -75,6 +70,20 @@ REFUSED: list[tuple[str, dict[str, Any]]] = [
     ("spots", {"spots": "none such"}),
 ]
 """Requests that are refused in every state, and change nothing."""
+
+
+@cache
+def frame_of(kind: str) -> NDArray[Any]:
+    """Return a frame of one of `KINDS`."""
+    if kind == "dark":
+        return np.full(LAYOUT.frame_shape, 100, np.uint16)
+    frame: NDArray[Any] = simulated(len(SPOTS))[SPOTS.index(kind) if kind in SPOTS else 1]
+    if kind == "bright":
+        frame[3, 3] = BRIGHT
+    elif kind in BAD:
+        frame = frame.astype(np.float32)
+        frame[:9:4, :20] = np.array(BAD[kind])[:, None]
+    return frame
 
 
 def make(settings: fs.Settings) -> fs.SlopePipeline:
@@ -184,8 +193,8 @@ class Engines(RuleBasedStateMachine):
 
     def pixels(self, kind: str) -> NDArray[Any]:
         assert self.ring is not None
-        frame = FRAMES["dark" if self.ring.dtype == np.uint16 and kind in BAD else kind]
-        return np.asarray(frame, self.ring.dtype)
+        is_left_out = self.ring.dtype == np.uint16 and kind in BAD
+        return np.asarray(frame_of("dark" if is_left_out else kind), self.ring.dtype)
 
     @precondition(lambda self: self.engine is not None and self.ring is not None)
     @rule(kinds=SEVERAL, step=STEPS)
