@@ -41,7 +41,7 @@ def slopes_of(images: Floats, flux_e: float, seed: int, options: dict[str, Any],
     noisy = fs.slopes.simulate.Detector(READ_NOISE_E).expose(flux_e * images, np.random.default_rng(seed))
     settings = fs.Settings(Window(**options), spot_fwhm_px=FWHM_PX, flux_e=flux_e * images.sum((1, 2)).mean())
     found = measure_images(
-        noisy, settings, calibration=fs.Calibration(read_noise_e=READ_NOISE_E), score=weights
+        noisy, settings, calibration=fs.Calibration(read_noise_e=READ_NOISE_E), weights=weights
     )
     return np.stack([found.x, found.y], axis=1).astype(np.float64)
 

@@ -97,7 +97,7 @@ def scored(
     name = "window" if method == "best linear" else method
     score = weights(calibration.read_noise_e, flux) if method == "best linear" else None
     settings = fs.Settings(name, flux_e=flux, search_range_px=1.5)
-    slopes = fs.SlopePipeline(LAYOUT, settings, calibration, psf=PSF, score=score)(frames)
+    slopes = fs.SlopePipeline(LAYOUT, settings, calibration, psf=PSF, weights=score)(frames)
     errors = np.stack([slopes.x, slopes.y], axis=-1) - truth
     stated = np.stack([slopes.standard_error_x, slopes.standard_error_y], axis=-1)
     ratios = np.sqrt(np.mean(np.square(errors / stated), axis=(0, 2)))

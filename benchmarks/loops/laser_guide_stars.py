@@ -141,7 +141,7 @@ def pipelines(case: Case, known: Known, flux: float) -> Iterator[tuple[str, fs.S
     noise = {"flux_e": flux, "read_noise_e": READ_NOISE_E}
 
     def made(settings: fs.Settings, psf: fs.PSF, score: Any = None) -> fs.SlopePipeline:
-        return fs.SlopePipeline(layout, settings, CALIBRATION, psf=psf, score=score)
+        return fs.SlopePipeline(layout, settings, CALIBRATION, psf=psf, weights=score)
 
     for width in (2.5, 3.2, 4.0, 5.0, 6.3, 8.0):
         gaussian = fs.Settings("window", flux_e=flux, window_fwhm_px=width)
@@ -311,7 +311,7 @@ def cutting_pipelines(layout: fs.Layout, psf: fs.PSF, width_px: float) -> dict[s
     ml = fs.Settings("ml", search_range_px=2.0)
     return {
         "weighted centre of gravity": fs.SlopePipeline(layout, window, CALIBRATION),
-        "linear matched filter": fs.SlopePipeline(layout, window, CALIBRATION, score=weights),
+        "linear matched filter": fs.SlopePipeline(layout, window, CALIBRATION, weights=weights),
         "ml": fs.SlopePipeline(layout, ml, CALIBRATION, psf=psf),
     }
 

@@ -82,7 +82,7 @@ settings = fs.Settings("window", flux_e=200.0, window_fwhm_px=5.0)  # replaced b
 
 def error_px(weights: fs.FixedWeights | None, spots: fs.PSF) -> float:
     """Return the rms error of the slopes in px."""
-    slopes = fs.SlopePipeline(layout, settings, calibration, psf=spots, score=weights)(frames)
+    slopes = fs.SlopePipeline(layout, settings, calibration, psf=spots, weights=weights)(frames)
     found = np.stack([slopes.x, slopes.y], axis=-1)
     found = (found - found.mean(axis=0)) * truth.var() / np.mean(found * truth)
     return float((found - truth + truth.mean(axis=0)).std())

@@ -227,7 +227,7 @@ def test_what_a_tools_file_says(tmp_path: Path) -> None:
         parts = parts_of(source)
         assert parts.settings == Settings("window", flux_e=40.0, spot_fwhm_px=2.0)
         assert parts.calibration.dark == 3.0
-        assert parts.spot == {"psf": None, "score": None}
+        assert parts.spot == {"psf": None, "weights": None}
     with refused("layuot"):
         parts_of({**tables, "layuot": {}})
     with refused("faintspot: calibration"):

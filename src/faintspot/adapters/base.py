@@ -33,7 +33,7 @@ FLUX_FRAMES = 1000.0
 _FIRST_FRAMES = 20  # averaged before the mean flux is used: one faint frame is too noisy
 _FOLLOW_EVERY = 10  # frames
 _LEAST_FLUX_E = 1e-3
-_PARTS = "estimator", "settings", "calibration", "psf", "score"
+_PARTS = "estimator", "settings", "calibration", "psf", "weights"
 _EXACT_PX = 1e-6  # rounding error of a centre
 
 
@@ -105,8 +105,8 @@ def parts_of(source: str | Path | Mapping[str, object]) -> Configuration:
     Parameters
     ----------
     source : path or mapping
-        A faintspot.toml, or its tables `estimator`, `settings`, `calibration`, `psf` and `score` as mappings,
-        with file names relative to the working directory.
+        A faintspot.toml, or its tables `estimator`, `settings`, `calibration`, `psf` and `weights` as
+        mappings, with file names relative to the working directory.
 
     Raises
     ------
@@ -125,7 +125,7 @@ class PipelineOptions(TypedDict, total=False):
     """Options that `ToolSlopes` passes on to `faintspot.SlopePipeline`."""
 
     psf: PSF | None
-    score: FixedWeights | None
+    weights: FixedWeights | None
     threads: int | None
 
 
@@ -153,7 +153,7 @@ class ToolSlopes:
         Time constant (frames) of the running mean of the flux for estimators that use it, if the settings
         have no `flux_e`; begins after 20 frames. None: the flux is that of each frame.
     **options
-        psf, score and threads; see `faintspot.SlopePipeline`.
+        psf, weights and threads; see `faintspot.SlopePipeline`.
 
     Raises
     ------

@@ -56,7 +56,7 @@ class SlopeEstimator(hcipy.WavefrontSensorEstimator):  # type: ignore[misc]
         Takes the last slopes, (2, n) m, and returns the prediction for the next frame, for estimators that
         use a prior; called before each frame except the first.
     **options
-        psf, score, calibration_flux_e, flux_frames, threads: see `faintspot.adapters.base.ToolSlopes`.
+        psf, weights, calibration_flux_e, flux_frames, threads: see `faintspot.adapters.base.ToolSlopes`.
 
     Attributes
     ----------

@@ -44,7 +44,7 @@ def attach(
         that use a prior; called before each frame except the first. For an asterism, a list with one for each
         source.
     **options
-        psf, score, calibration_flux_e, flux_frames, threads: see `faintspot.adapters.base.ToolSlopes`.
+        psf, weights, calibration_flux_e, flux_frames, threads: see `faintspot.adapters.base.ToolSlopes`.
 
     Returns
     -------

@@ -61,7 +61,7 @@ def slopes_process() -> type:
     Its configuration is that of a `SlopesProcess` of type "SHWFS", and
 
     faintspot : str or dict
-        A faintspot.toml, or its tables: `settings` (and `estimator`), `calibration`, `psf`, `score`.
+        A faintspot.toml, or its tables: `settings` (and `estimator`), `calibration`, `psf`, `weights`.
     noise_free : bool
         Whether frames are noise-free calibration frames, e.g. of a simulated sensor. Default: false.
     calibration_flux_e, flux_frames : float
@@ -286,7 +286,7 @@ class _Measuring:
             parts.settings,
             parts.calibration,
             psf=parts.psf,
-            score=parts.score,
+            weights=parts.weights,
             calibration_flux_e=self.flux_e,
             flux_frames=self.flux_frames,
         )

@@ -39,7 +39,7 @@ TABLES = (
     "estimator",
     "settings",
     "psf",
-    "score",
+    "weights",
     "laser",
     "promise",
     "loop",

@@ -55,7 +55,7 @@ def test_ellipses_hold_95_percent(name: str, flux: float) -> None:
         "filter": (window, fs.FixedWeights.matched(PSF, SIDE, flux_e=flux, read_noise_e=1.0)),
         "shape": (window, fs.FixedWeights.shaped(PSF, SIDE)),
     }[name]
-    slopes = fs.SlopePipeline(LAYOUT, settings, CALIBRATION, psf=PSF, score=score)(frames)
+    slopes = fs.SlopePipeline(LAYOUT, settings, CALIBRATION, psf=PSF, weights=score)(frames)
     assert slopes.measured.all()
     assert slopes.valid.mean() > 0.97, slopes.valid.mean()
     found = distances(slopes, truth)

@@ -363,7 +363,7 @@ def test_spots_of_a_laser_guide_star(tmp_path: Path) -> None:
     """Places are from the middle of the pupil; a PSF or weights of their own go before."""
     path = written(tmp_path, SENSOR + WINDOW + LASER)
     described = configuration.Configuration(path)
-    psf, weights = described.psf, described.score
+    psf, weights = described.psf, described.weights
     x, y = np.meshgrid(1.3 * (np.arange(4) - 1.5), 1.3 * (np.arange(3) - 1.0))
     places = np.stack([x.ravel(), y.ravel()], axis=1)
     star = fs.LaserGuideStar(places, [-5.0, 0.0], 0.5, fs.PSF.analytic("gaussian", size=1.2))
@@ -393,4 +393,4 @@ def test_spots_of_a_laser_guide_star(tmp_path: Path) -> None:
 def test_a_laser_guide_star_that_is_refused(tmp_path: Path, old: str, new: str) -> None:
     path = written(tmp_path, (SENSOR + WINDOW + LASER).replace(old, new))
     with refused(f"{path}"):
-        _ = configuration.Configuration(path).score
+        _ = configuration.Configuration(path).weights

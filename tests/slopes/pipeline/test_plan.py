@@ -86,8 +86,8 @@ class TestConfiguration:
         again = configuration.Configuration(path)
         assert again.psf is not None
         assert np.allclose(again.psf.samples, psf.samples)
-        assert again.score is not None
-        assert np.array_equal(again.score.x, weights().x)
+        assert again.weights is not None
+        assert np.array_equal(again.weights.x, weights().x)
         frame = frames(1, 300.0)[0][0]
         expected = fs.SlopePipeline(LAYOUT, fs.Settings(estimator="ml"), NOISE, psf=psf)(frame)
         assert np.array_equal(fs.SlopePipeline.from_file(path)(frame).x, expected.x)
@@ -109,7 +109,7 @@ class TestConfiguration:
             ('[psf]\nfile = "none.npz"\n', "none.npz: no such file"),
             ('[psf]\nprofile = "gaussian"\nsise = 1.0\n', "psf.sise: unknown key"),
             ('[psf]\nprofile = "moffat"\n', "expected one of 'diffraction', 'gaussian'"),
-            ('[score]\nfiel = "a.npz"\n', "score.fiel: unknown key"),
+            ('[weights]\nfiel = "a.npz"\n', "weights.fiel: unknown key"),
         ],
     )
     def test_mistakes_in_the_table_are_refused(self, tmp_path: Path, table: str, message: str) -> None:

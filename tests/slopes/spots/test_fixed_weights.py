@@ -48,7 +48,7 @@ def learnt() -> fs.FixedWeights:
 @pytest.mark.slow
 def test_the_best_linear_weights_beat_every_gaussian_window(learnt: fs.FixedWeights) -> None:
     """Their mean square error is the least of all linear ones; 1 % for what the samples differ."""
-    best, gain = errors(window(2.0), score=learnt)
+    best, gain = errors(window(2.0), weights=learnt)
     gaussian = [errors(window(fwhm))[0] for fwhm in (1.5, 2.0, 2.5, 3.0, 4.0)]
     assert best < 1.01 * min(gaussian)
     assert gain == pytest.approx(1.0, abs=0.02)  # 20,000 spots of .5 px with errors of about 1 px: +-.01
@@ -74,7 +74,7 @@ def test_weights_equal_a_sum_over_the_pixels(learnt: fs.FixedWeights) -> None:
     clean, _ = spots_of_a_loop(50, 9)
     images = (FLUX_E * clean).astype(np.float32)
     found = measure_images(
-        images, window(2.0), calibration=fs.Calibration(read_noise_e=NOISE_E), score=learnt
+        images, window(2.0), calibration=fs.Calibration(read_noise_e=NOISE_E), weights=learnt
     )
     expected = np.einsum("yx,nyx->n", learnt.x[0], images / FLUX_E - learnt.mean_spot[0])
     np.testing.assert_allclose(found.x, expected, atol=1e-5)  # float32 sums of 144 pixels
@@ -84,7 +84,9 @@ def test_stated_errors_are_those_of_the_slopes(learnt: fs.FixedWeights) -> None:
     """Of a spot at the mean position, for which they are meant."""
     clean = np.repeat(spots(np.zeros((1, 2)), shape=(SIDE, SIDE), profile="gaussian", size=1.0), 6000, 0)
     noisy = fs.slopes.simulate.Detector(NOISE_E).expose(FLUX_E * clean, np.random.default_rng(2))
-    found = measure_images(noisy, window(2.0), calibration=fs.Calibration(read_noise_e=NOISE_E), score=learnt)
+    found = measure_images(
+        noisy, window(2.0), calibration=fs.Calibration(read_noise_e=NOISE_E), weights=learnt
+    )
     # 6000 slopes: 0.9 %; the mean spot of the training is wider than one spot.
     assert found.x.std() == pytest.approx(float(found.standard_error_x[0]), rel=0.04)
 
@@ -139,7 +141,7 @@ def test_quad_cells_are_sums_of_four_pixels() -> None:
     weights = fs.FixedWeights(0.5 * cell, 0.5 * cell.T, np.full((2, 2), 0.25))
     images = np.array([[[1.0, 3.0], [1.0, 3.0]], [[4.0, 4.0], [0.0, 0.0]]])
     found = measure_images(
-        images, fs.Settings("window"), calibration=fs.Calibration(read_noise_e=0.1), score=weights
+        images, fs.Settings("window"), calibration=fs.Calibration(read_noise_e=0.1), weights=weights
     )
     np.testing.assert_allclose(found.vector, [0.25, 0.0, 0.0, -0.5], atol=1e-6)
 
@@ -169,7 +171,7 @@ def test_what_is_refused(learnt: fs.FixedWeights) -> None:
         fs.FixedWeights.shaped(ELONGATED, (1, 1))
     layout = fs.Layout.grid((2, 2), pixels=8)
     with refused("windows of 8 x 8 px", "got 12 x 12"):
-        fs.SlopePipeline(layout, fs.Settings("window"), score=learnt)
+        fs.SlopePipeline(layout, fs.Settings("window"), weights=learnt)
     with refused("settings.flux_e"):
         fs.SlopePipeline(layout, fs.Settings(Window(normalisation="mean"), spot_fwhm_px=2.0))
 
@@ -223,6 +225,6 @@ def test_weights_of_psfs_work_in_a_pipeline_per_subaperture() -> None:
     truth = np.array([[0.05, -0.1], [-0.08, 0.02]])
     frame = np.concatenate(list(ELONGATED.images(truth, (SIDE, SIDE), 1e4, which=[0, 1])), axis=1)
     layout = fs.Layout.grid((1, 2), pixels=SIDE)
-    slopes = fs.SlopePipeline(layout, fs.Settings("window", flux_e=1e4), score=weights)(frame)
+    slopes = fs.SlopePipeline(layout, fs.Settings("window", flux_e=1e4), weights=weights)(frame)
     # Moves of a tenth of a pixel are linear to 1 %.
     np.testing.assert_allclose(np.stack([slopes.x, slopes.y], axis=1), truth, atol=2e-3)

@@ -42,7 +42,7 @@ class FaintspotSlopec(Slopec):  # type: ignore[misc]
     subapdata : SubapData
         SPECULA's sub-apertures.
     faintspot : str or dict
-        A faintspot.toml, or its tables: `settings` (and `estimator`), `calibration`, `psf`, `score`.
+        A faintspot.toml, or its tables: `settings` (and `estimator`), `calibration`, `psf`, `weights`.
     calibrating : bool
         True in parameter files for calibration (slope null, interaction matrix), whose detector is
         noise-free: frames are then measured at `calibration_flux_e`, see `ToolSlopes.calibrating`.
@@ -87,7 +87,7 @@ class FaintspotSlopec(Slopec):  # type: ignore[misc]
         self._settings, self._calibration = parts.settings, parts.calibration
         self._options: AdapterOptions = {
             "psf": parts.psf,
-            "score": parts.score,
+            "weights": parts.weights,
             "calibration_flux_e": calibration_flux_e,
             "flux_frames": flux_frames if flux_frames > 0 else None,
         }

@@ -196,7 +196,7 @@ class PipelineMaker:
     layout: Layout
     calibration: Calibration
     psf: PSF | None = None
-    score: FixedWeights | None = None
+    weights: FixedWeights | None = None
     reference: NDArray[Any] | None = None
     """Reference slopes, as for `SlopePipeline`."""
 
@@ -210,4 +210,4 @@ class PipelineMaker:
     def __call__(self, settings: Settings) -> SlopePipeline:
         """Return the pipeline with settings."""
         parts = self.layout, settings, self.calibration, self.reference
-        return SlopePipeline(*parts, psf=self.psf, score=self.score)
+        return SlopePipeline(*parts, psf=self.psf, weights=self.weights)

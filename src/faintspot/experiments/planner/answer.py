@@ -154,8 +154,8 @@ class Answer:
     def save(self, path: str | Path) -> None:
         """Write the recommended settings as a configuration file; what else it holds stays.
 
-        PSF and score lie beside it, with a laser the PSF of every sub-aperture; the table [promise] says what
-        the recording made of it, if any. Without a layout the file holds the other tables only.
+        PSF and weights lie beside it, with a laser the PSF of every sub-aperture; the table [promise] says
+        what the recording made of it, if any. Without a layout the file holds the other tables only.
 
         Raises
         ------
@@ -168,7 +168,7 @@ class Answer:
             best.settings,
             self.calibration,
             self._psf,
-            best.method.score,
+            best.method.weights,
         ):
             if item is not None:
                 configuration.save(path, item)

@@ -343,7 +343,7 @@ class SimulatedSpots:
     def measure(self, sample: SpotFrames, method: Method) -> Slopes:
         """Measure the spots of a sample as the user's own frames would be."""
         # What knows the spot takes time to prepare, and often has the same settings at every flux.
-        key = f"{method.settings} {id(method.psf)} {id(method.score)}"
+        key = f"{method.settings} {id(method.psf)} {id(method.weights)}"
         if key not in self._pipelines:
             self._pipelines[key] = SlopePipeline(
                 self.layout, method.settings, self.calibration, **method.parts

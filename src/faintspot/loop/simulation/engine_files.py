@@ -82,7 +82,7 @@ def write_engine_files(
     if not configuration_file.has(path, "settings"):
         configuration_file.save(path, fixed_window(configuration))
     stored = configuration_file.Configuration(path)
-    method = _method(stored.settings, psf, stored.score, control)
+    method = _method(stored.settings, psf, stored.weights, control)
     reference = reference_slopes(configuration, optics.sensor, method)
     write_atomically(folder / INTERACTION, lambda stream: np.save(stream, optics.interaction))
     write_atomically(folder / REFERENCE, lambda stream: np.save(stream, reference))
@@ -107,7 +107,7 @@ def fixed_window(configuration: LoopConfiguration, **options: object) -> Setting
     return Settings("window", window_fwhm_px=width, flux_e=configuration.photons, **options)
 
 
-def _method(settings: Settings, psf: PSF, score: FixedWeights | None, control: str) -> Method:
+def _method(settings: Settings, psf: PSF, weights: FixedWeights | None, control: str) -> Method:
     """Return the method of the simulated loop that equals the engine's."""
     with_prior = control == KALMAN and settings.estimator.takes_prior
     if with_prior and PRIOR in settings.declared() and getattr(settings, PRIOR) is None:
@@ -117,7 +117,7 @@ def _method(settings: Settings, psf: PSF, score: FixedWeights | None, control: s
         "-",
         settings,
         psf=psf,
-        score=score,
+        weights=weights,
         control=control,
         variants=(PREDICTED,) if with_prior else (),
     )

@@ -86,7 +86,7 @@ class _TelemetryMethod:
             **vars(plain),
             "settings": to_text(plain.settings),
             "psf": id(method.psf),
-            "score": id(method.score),
+            "weights": id(method.weights),
         }
         return cls(plain, tuple(values.items()))
 

@@ -58,7 +58,7 @@ class Method(Options, table="method"):
         learn from telemetry of a loop with the integrator, in other turbulence.
     noise_scale : float
         What control multiplies the variance of the slopes' noise by that telemetry shows.
-    psf, score : PSF, FixedWeights, optional
+    psf, weights : PSF, FixedWeights, optional
         For the estimators that need them. Default PSF: that of a flat wavefront.
 
     Raises
@@ -84,7 +84,7 @@ class Method(Options, table="method"):
     control: str = setting(INTEGRATOR, choices=tuple(CONTROLS))
     noise_scale: float = number(1.0, 0, 100, low_open=True)
     psf: PSF | None = None
-    score: FixedWeights | None = None
+    weights: FixedWeights | None = None
 
     @classmethod
     def named(cls, name: str) -> Method:
@@ -141,7 +141,7 @@ class Method(Options, table="method"):
     @property
     def parts(self) -> dict[str, Any]:
         """Arguments of a pipeline beside settings and calibration."""
-        return {"psf": self.psf, "score": self.score}
+        return {"psf": self.psf, "weights": self.weights}
 
     @property
     def has_prior(self) -> bool:

@@ -81,7 +81,7 @@ def make_pipeline(configuration: LoopConfiguration, sensor: ShackHartmann, metho
         camera_calibration(configuration),
         reference_slopes(configuration, sensor, method),
         psf=_psf(configuration, method),
-        score=method.score,
+        weights=method.weights,
         threads=1,
     )
 
@@ -99,7 +99,7 @@ def reference_slopes(
         method.settings.replace(estimator=method.settings.estimator.for_bright_flux(), flux_e=None),
         Calibration(dark=0.0, read_noise_e=1.0),
         psf=_psf(configuration, method),
-        score=method.score,
+        weights=method.weights,
         threads=1,
     )
     flat = sensor.spots(np.zeros((sensor.points, sensor.points), np.float32))

@@ -22,7 +22,7 @@ class Sensor:
     ----------
     layout : Layout
     calibration : Calibration
-    psf, score : PSF, FixedWeights, or None
+    psf, weights : PSF, FixedWeights, or None
     zero : (n, 2) array
         Reference positions, px from the window centres.
     search_range_px : (n,) array
@@ -38,7 +38,7 @@ class Sensor:
     layout: Layout
     calibration: Calibration
     psf: PSF | None
-    score: FixedWeights | None
+    weights: FixedWeights | None
     zero: Floats
     search_range_px: Floats
     flux_e: Floats

@@ -1,6 +1,6 @@
-"""One TOML file (faintspot.toml) for layout, calibration, estimator, settings, PSF and score.
+"""One TOML file (faintspot.toml) for layout, calibration, estimator, settings, PSF and weights.
 
-Calibration maps, PSF and score are stored beside it, in NAME.calibration.npz etc., and named in it.
+Calibration maps, PSF and weights are stored beside it, in NAME.calibration.npz etc., and named in it.
 """
 
 from __future__ import annotations
@@ -87,18 +87,18 @@ class Configuration(Tables):
             return PSF.load(self._named_file(values, ("file", "profile")))
 
     @cached_property
-    def score(self) -> FixedWeights | None:
+    def weights(self) -> FixedWeights | None:
         """Score that is named, else the linear matched filter of a laser guide star, if wanted, or None."""
-        values = self.tables.get("score")
+        values = self.tables.get("weights")
         if values is None:
             return self._laser_score()
-        with errors_within(self.path, "score."):
+        with errors_within(self.path, "weights."):
             return FixedWeights.load(self._named_file(values, ("file",)))
 
     @property
     def spot(self) -> dict[str, Any]:
-        """PSF and score, as a pipeline takes them."""
-        return {"psf": self.psf, "score": self.score}
+        """PSF and weights, as a pipeline takes them."""
+        return {"psf": self.psf, "weights": self.weights}
 
     def _laser_psf(self) -> PSF | None:
         """Return the PSF of each sub-aperture that sees the laser guide star, or None."""
@@ -157,7 +157,7 @@ def save(path: str | Path, item: Item) -> None:
     if not isinstance(item, PSF | FixedWeights):
         item.save(path)
         return
-    table = "psf" if isinstance(item, PSF) else "score"
+    table = "psf" if isinstance(item, PSF) else "weights"
     store = derived(path, f".{table}.npz")
     item.save(store)
     save_tables(path, {table: {"file": store.name}})

@@ -113,9 +113,14 @@ class SpotFollower:
     def _of_images(self) -> SlopePipeline:
         """Return the pipeline of windows that are already cut, calibrated, and centred on their spots."""
         given, layout = self.pipeline, self.pipeline.binned_layout
-        psf, score = given.spot
+        psf, weights = given.spot
         reference = self._in_window - layout.offsets
-        options: dict[str, Any] = {"psf": psf, "score": score, "width": given.width, "threads": given.threads}
+        options: dict[str, Any] = {
+            "psf": psf,
+            "weights": weights,
+            "width": given.width,
+            "threads": given.threads,
+        }
         return SlopePipeline(layout, *given.binned_parts, reference, **options).for_images()
 
     def __call__(self, frame: ArrayLike) -> Slopes:
@@ -303,7 +308,7 @@ def measure_images(
     *,
     calibration: Calibration | None = None,
     psf: PSF | None = None,
-    score: FixedWeights | None = None,
+    weights: FixedWeights | None = None,
     prior: ArrayLike | None = None,
 ) -> Slopes:
     """Measure the positions of the spots in a stack of images, each image a separate sub-aperture.
@@ -316,7 +321,7 @@ def measure_images(
         Arrays in it hold one value per image. If `flux_e` is not given, the mean flux of the stack is used.
     calibration : Calibration, optional
         Gain, dark level and read noise; maps are not allowed.
-    psf, score
+    psf, weights
         As for `SlopePipeline`; an index holds the PSF or kind of each image.
     prior : (n, 2) array, optional
         Predicted positions, px from the image centres.
@@ -347,5 +352,5 @@ def measure_images(
         raise InputError(f"images: expected shape (n, ny, nx), got {stack.shape}")
     n, ny, nx = stack.shape
     layout = Layout.stacked(n, (ny, nx))
-    pipeline = SlopePipeline(layout, settings, calibration, psf=psf, score=score)
+    pipeline = SlopePipeline(layout, settings, calibration, psf=psf, weights=weights)
     return pipeline(stack.reshape(n * ny, nx), prior)

@@ -73,7 +73,7 @@ class Plan:
 
     Parameters
     ----------
-    layout, settings, calibration, psf, score
+    layout, settings, calibration, psf, weights
         As for `SlopePipeline`.
     zero : (n, 2) array
         Reference positions, px from the window centres.
@@ -92,7 +92,7 @@ class Plan:
         settings: Settings,
         calibration: Calibration,
         psf: PSF | None,
-        score: FixedWeights | None,
+        weights: FixedWeights | None,
         zero: Floats,
         width: int,
     ) -> None:
@@ -106,7 +106,7 @@ class Plan:
             layout,
             calibration,
             psf,
-            score,
+            weights,
             zero,
             np.where(np.isnan(search), np.inf, search),
             per_subaperture("flux_e").astype(np.float64),

@@ -78,7 +78,7 @@ class SlopePipeline:
         must not exceed the longer side of the frame. Default: 0.
     psf : PSF, optional
         Required by estimators that use the spot shape; it provides the spot width to others.
-    score : FixedWeights, optional
+    weights : FixedWeights, optional
         Fixed weights of a window.
     width : int, optional
         SIMD width in float32 numbers: 4, 8 or 16. Default: the width of the machine.
@@ -113,7 +113,7 @@ class SlopePipeline:
         reference: ArrayLike | Slopes | None = None,
         *,
         psf: PSF | None = None,
-        score: FixedWeights | None = None,
+        weights: FixedWeights | None = None,
         width: int | None = None,
         threads: int | None = None,
     ) -> None:
@@ -126,7 +126,7 @@ class SlopePipeline:
             threads = int(number_between("threads", threads, 1, 4096, integer=True))
         self.threads = threads
         self._lanes = lanes_for(np.float32, width)
-        self._parts = psf, score, layout.offsets + reference_positions(reference, layout)
+        self._parts = psf, weights, layout.offsets + reference_positions(reference, layout)
         self._prepare()
 
     @classmethod
@@ -140,11 +140,11 @@ class SlopePipeline:
         """Compute the tables for the current SIMD width; forget what was prepared for small frames."""
         self._small = threading.local()
         width, factor = self._lanes.width, self.layout.bin
-        psf, score, zero = self._parts
+        psf, weights, zero = self._parts
         settings, calibration = self.binned_parts
         maps = calibration.maps(self.binned_layout.frame_shape)
         self._calibration = packed_calibration(self.binned_layout, maps, width)
-        self.plan = Plan(self.binned_layout, settings, calibration, psf, score, zero / factor, width)
+        self.plan = Plan(self.binned_layout, settings, calibration, psf, weights, zero / factor, width)
         """Settings and tables computed before the first frame."""
         self.light_test = light_test(self.binned_layout, maps, self.plan.typical_fwhm_px)
         """Test for sub-apertures without flux."""
@@ -183,7 +183,7 @@ class SlopePipeline:
 
     @property
     def spot(self) -> tuple[PSF | None, FixedWeights | None]:
-        """PSF and score of the pipeline."""
+        """PSF and weights of the pipeline."""
         return self._parts[:2]
 
     def with_settings(self, settings: Settings) -> SlopePipeline:
@@ -489,10 +489,10 @@ def _camera_type(frame: ArrayLike) -> np.dtype[np.generic]:
     return frame.dtype if isinstance(frame, np.ndarray) else np.asarray(frame).dtype
 
 
-def _identity(psf: PSF | None, score: FixedWeights | None, zero: NDArray[np.float64]) -> bytes:
+def _identity(psf: PSF | None, weights: FixedWeights | None, zero: NDArray[np.float64]) -> bytes:
     """Return a digest of the inputs of slopes other than layout, settings and calibration."""
     digest = hashlib.sha256(zero.tobytes())
-    for part in (psf, score):
+    for part in (psf, weights):
         for field in fields(part) if part is not None else ():
             value = getattr(part, field.name)
             content = value.tobytes() if isinstance(value, np.ndarray) else repr(value).encode()

@@ -393,10 +393,10 @@ def _attributes(
 
 
 def _files_of_the_spot(described: Configuration) -> dict[str, str]:
-    """Return the files of PSF and score, for a report: their own, or the configuration."""
+    """Return the files of PSF and weights, for a report: their own, or the configuration."""
     path = described.path.resolve()
     return {
         f"{part}_file": str(path.parent / described[part].get("file", path.name))
-        for part in ("psf", "score")
+        for part in ("psf", "weights")
         if part in described
     }

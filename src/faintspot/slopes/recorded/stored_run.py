@@ -40,12 +40,12 @@ class StoredRun:
     settings: Settings | None = None
     calibration: Calibration | None = None
     spot: dict[str, Any] = field(default_factory=dict)
-    """PSF and score, as for `SlopePipeline`; None where there are none."""
+    """PSF and weights, as for `SlopePipeline`; None where there are none."""
     laser: LaserSpots | None = None
     flux_unit: str = "e-"
     """Unit of the flux: "ADU" where the configuration states no gain of the camera."""
     lost: list[str] = field(default_factory=list)
-    """Optional parts of a pipeline: a PSF or a score, whose file may be missing."""
+    """Optional parts of a pipeline: a PSF or weights, whose file may be missing."""
 
     @property
     def about_reference(self) -> str:
@@ -149,13 +149,13 @@ def _rebuild(store: StoredRun, layout_only: bool) -> None:
         store.calibration = _original_calibration(store, table)
     else:
         store.calibration = stored.calibration
-    loaders = {"psf": PSF.load, "score": FixedWeights.load}
+    loaders = {"psf": PSF.load, "weights": FixedWeights.load}
     store.spot = {part: _of_the_spot(store, part, load) for part, load in loaders.items()}
     store.laser = _of_the_spot(store, "laser", lambda path: configuration.Configuration(path).laser)
 
 
 def _of_the_spot(store: StoredRun, name: str, load: Callable[[str], object]) -> Any:
-    """Read the PSF or the score of the run; a missing file is reported when it is needed."""
+    """Read the PSF or the weights of the run; a missing file is reported when it is needed."""
     attributes = store.stored.attributes
     file, original = (str(attributes.get(key, "")) for key in (f"{name}_file", "configuration_file"))
     try:
@@ -164,7 +164,7 @@ def _of_the_spot(store: StoredRun, name: str, load: Callable[[str], object]) -> 
         if file or Path(original).is_file():
             return getattr(configuration.Configuration(original), name)
     except InputError as error:
-        words = {"psf": "PSF", "score": "fixed weights", "laser": "laser guide star"}[name]
+        words = {"psf": "PSF", "weights": "fixed weights", "laser": "laser guide star"}[name]
         store.lost.append(f"the {words} of {store.path.name} is gone ({error})")
     return None
 

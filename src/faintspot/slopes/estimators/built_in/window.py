@@ -51,7 +51,7 @@ class _WindowPlan(EstimatorPlan):
     @cached_property
     def weights(self) -> FixedWeights:
         """Weights given to the pipeline, or those of the Gaussian windows."""
-        given, sensor = self.sensor.score, self.sensor
+        given, sensor = self.sensor.weights, self.sensor
         if not isinstance(given, FixedWeights):
             return self._gaussian()
         gain, region = self.each("centroid_gain"), self._half_regions()
@@ -170,7 +170,7 @@ class _WindowPlan(EstimatorPlan):
         """See `EstimatorPlan`."""
         weights, sensor = self.weights, self.sensor
         kinds = weights.index_of(sensor.n)
-        fixed = isinstance(sensor.score, FixedWeights)
+        fixed = isinstance(sensor.weights, FixedWeights)
         table[window.HOME_X], table[window.HOME_Y] = (sensor.layout.offsets if fixed else sensor.zero).T
         photons = sensor.excess_noise * np.maximum(weights.mean_spot, 0.0)
         rows = zip(
@@ -263,7 +263,7 @@ class Window(Estimator):
 
     def check(self, sensor: Sensor) -> None:
         """See `Estimator`."""
-        weights = sensor.score
+        weights = sensor.weights
         if isinstance(weights, FixedWeights):
             if weights.window != sensor.window:
                 wanted, got = (f"{ny} x {nx}" for ny, nx in (sensor.window, weights.window))
