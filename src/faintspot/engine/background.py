@@ -19,12 +19,12 @@ from faintspot.engine.engine import Engine
 from faintspot.engine.processes.child_processes import ONE_THREAD, ChildProcesses, low_priority
 from faintspot.engine.processes.requests import LENGTHY_TIMEOUT_S, request, socket_path
 from faintspot.engine.telemetry.ring import TelemetryRing
-from faintspot.io.telemetry import Telemetry, stored_names
+from faintspot.io.telemetry import CLOSED_LOOP, Telemetry, stored_names
 from faintspot.loop.control.base import KALMAN
 from faintspot.loop.control.configuration import Control, load_control, prior_std_px
 from faintspot.loop.control.identification.learning import FEWEST_FRAMES, RelearntControl, relearn
 from faintspot.loop.control.identification.open_loop import known_delay, open_loop_of
-from faintspot.loop.telemetry.recording import CLOSED, recorded_loop, site_of
+from faintspot.loop.telemetry.recording import recorded_loop, site_of
 from faintspot.slopes.pipeline.configuration import Configuration
 from faintspot.slopes.pipeline.settings import Settings
 
@@ -68,7 +68,7 @@ class BackgroundLearning:
     def take(self) -> bool:
         """Take the records that have come; return whether they are enough to learn from."""
         records, self._cursor, dropped = self._reader.records.since(self._cursor)
-        closed = records["loop"] == CLOSED
+        closed = records["loop"] == CLOSED_LOOP
         if dropped or not closed.all():
             self._records.clear()
         elif len(records):

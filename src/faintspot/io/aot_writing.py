@@ -18,9 +18,8 @@ from faintspot.base.errors import InputError, MissingExtraError
 from faintspot.base.files import write_atomically
 from faintspot.base.text_files import parse_text, to_json
 from faintspot.io.fits_units import SIDE
-from faintspot.io.telemetry import Telemetry
+from faintspot.io.telemetry import CLOSED_LOOP, Telemetry
 
-_CLOSED = 2  # state of the loop
 _ARCSEC = np.pi / 180 / 3600
 AO_MODES = ("SCAO", "SLAO", "GLAO", "MOAO", "LTAO", "MCAO")
 
@@ -87,7 +86,7 @@ def _system(telemetry: Telemetry, ao_mode: str) -> Any:
         "LOOP",
         commanded_corrector=mirror,
         input_sensor=sensor,
-        closed=bool((np.asarray(telemetry.loop) == _CLOSED).any()),
+        closed=bool((np.asarray(telemetry.loop) == CLOSED_LOOP).any()),
         commands=aotpy.Image("COMMANDS", np.asarray(telemetry.commands)) if commands else None,
     )
     return aotpy.AOSystem(

@@ -25,6 +25,8 @@ from faintspot.io.zarr_store import (
 zarr = load_package("zarr")
 FRAMES, IMAGES = "finished_frames", "finished_images"
 """Attributes of a store: numbers of complete frames and images."""
+CLOSED_LOOP = 2
+"""State of a closed loop in `Telemetry.loop`."""
 CONTROL = "control"
 """A large attribute, in a group of its own: the others are replaced with every block of frames."""
 _NOT_STORED = "sequence"  # used by the rings only

@@ -27,7 +27,7 @@ from faintspot.experiments.night.page import (
 from faintspot.experiments.night.protocol import Night
 from faintspot.experiments.night.recorded_methods import MeasuredStrehl, RecordedMethods, conditions_of
 from faintspot.experiments.night.simulated import r0_of_slopes
-from faintspot.io.telemetry import Telemetry, read_telemetry
+from faintspot.io.telemetry import CLOSED_LOOP, Telemetry, read_telemetry
 from faintspot.loop.control.configuration import RecordedControl
 from faintspot.loop.telemetry.alternation import (
     AlternatingLoop,
@@ -41,7 +41,6 @@ from faintspot.loop.telemetry.alternation import (
 )
 from faintspot.loop.telemetry.choices import unseen_m2
 from faintspot.loop.telemetry.recorded_loop import control_of, system_numbers
-from faintspot.loop.telemetry.recording import CLOSED
 from faintspot.slopes.sensor.pupil import side_m
 
 SCIENCE_WAVELENGTH_M = 1.65e-6
@@ -70,7 +69,7 @@ class RecordedNight:
 def alternates(path: str | Path) -> bool:
     """Return whether a store holds telemetry of several methods that alternated in a closed loop."""
     telemetry = read_telemetry(path, images=False)
-    return len(np.unique(telemetry.method[telemetry.loop == CLOSED])) > 1
+    return len(np.unique(telemetry.method[telemetry.loop == CLOSED_LOOP])) > 1
 
 
 def recorded_night(
@@ -141,7 +140,7 @@ def _loop(
         telemetry.commands,
         telemetry.frame,
         telemetry.unix_time_s,
-        np.where(telemetry.loop == CLOSED, methods.number[telemetry.method], -1),
+        np.where(telemetry.loop == CLOSED_LOOP, methods.number[telemetry.method], -1),
         conditions_of(telemetry)[0],
         control.interaction,
         control.options.delay_frames,

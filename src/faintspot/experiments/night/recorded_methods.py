@@ -13,10 +13,9 @@ from faintspot.base.arrays import Floats
 from faintspot.base.errors import InputError
 from faintspot.base.text_files import parse_text
 from faintspot.io.frames import read_array
-from faintspot.io.telemetry import Telemetry
+from faintspot.io.telemetry import CLOSED_LOOP, Telemetry
 from faintspot.loop.control.base import CONTROLS, INTEGRATOR, KALMAN, split_control
 from faintspot.loop.control.configuration import RecordedControl
-from faintspot.loop.telemetry.recording import CLOSED
 from faintspot.slopes.estimators.registry import estimators
 from faintspot.slopes.pipeline.settings import option_names
 
@@ -53,7 +52,7 @@ class RecordedMethods:
     def of(cls, telemetry: Telemetry, control: RecordedControl) -> RecordedMethods:
         """Return the methods of a recording."""
         names = [str(name) for name in telemetry.attributes.get("methods") or [_SET]]
-        seen = np.unique(telemetry.method[telemetry.loop == CLOSED])
+        seen = np.unique(telemetry.method[telemetry.loop == CLOSED_LOOP])
         names += [f"method {number}" for number in range(len(names), int(seen.max(initial=-1)) + 1)]
         labels = tuple(dict.fromkeys(names[number] for number in seen))
         number = np.full(len(names), -1)

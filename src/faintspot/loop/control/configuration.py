@@ -25,10 +25,10 @@ from faintspot.loop.control.options import (
     NONE,
     STREAM,
     TABLE,
+    TIP_TILT_FOCUS,
     ControlOptions,
 )
 from faintspot.loop.control.reconstructor import Reconstructor, make_reconstructor
-from faintspot.loop.control.removed_modes import TIP_TILT_FOCUS, RemovedModes
 from faintspot.slopes.camera.calibration import Calibration
 from faintspot.slopes.pipeline.configuration import Configuration
 from faintspot.slopes.pipeline.settings import Settings
@@ -37,6 +37,7 @@ from faintspot.slopes.sensor.layout import Layout
 if TYPE_CHECKING:
     from faintspot.loop.control.identification.model import Kalman
     from faintspot.loop.control.integrator import LoopPlant
+    from faintspot.loop.control.removed_modes import RemovedModes
 
 
 INTERACTION, REFERENCE = "interaction_matrix", "reference_slopes"
@@ -125,6 +126,8 @@ class Control:
     @cached_property
     def removed_modes(self) -> RemovedModes:
         """Modes that are removed from the slopes before reconstruction."""
+        from faintspot.loop.control.removed_modes import RemovedModes  # a recording's control needs none
+
         return RemovedModes(self.options.removed_modes, self.positions)
 
     @cached_property

@@ -4,9 +4,10 @@ from dataclasses import dataclass
 
 from faintspot.base.options import Options, setting
 from faintspot.loop.control.base import CONTROLS, INTEGRATOR
-from faintspot.loop.control.removed_modes import REMOVED_MODES
 
 TABLE = "control"
+NO_MODES, TIP_TILT, TIP_TILT_FOCUS = "none", "tip_tilt", "tip_tilt_focus"
+REMOVED_MODES = NO_MODES, TIP_TILT, TIP_TILT_FOCUS
 NONE, CONTROLLER, STREAM = "none", "controller", "stream"
 """Sources of predictions."""
 BEYOND_ALL = 1e30

@@ -10,10 +10,9 @@ from faintspot.base.checks import finite_array, one_of
 from faintspot.base.errors import InputError
 from faintspot.base.flags import UNMEASURED
 from faintspot.loop.control.integrator import MEAN_SQUARE
+from faintspot.loop.control.options import NO_MODES, REMOVED_MODES, TIP_TILT_FOCUS
 from faintspot.slopes.kernels.compiling import Direct, compiled_with
 
-NO_MODES, TIP_TILT, TIP_TILT_FOCUS = "none", "tip_tilt", "tip_tilt_focus"
-REMOVED_MODES = NO_MODES, TIP_TILT, TIP_TILT_FOCUS
 _LEAST_SPREAD = 1e-9  # of the positions, relative to their size: less has no focus
 _UNMEASURED = int(UNMEASURED)
 _compiled = partial(compiled_with, source=__file__)

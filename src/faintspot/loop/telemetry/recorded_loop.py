@@ -21,7 +21,7 @@ from faintspot.io.frames import read_array
 from faintspot.io.loop_layouts import read_layout
 from faintspot.io.loop_streams import holds_session, holds_streams, read_session, read_streams
 from faintspot.io.slopes import holds_slopes
-from faintspot.io.telemetry import read_telemetry
+from faintspot.io.telemetry import CLOSED_LOOP, read_telemetry
 from faintspot.io.zarr_store import holds_telemetry
 from faintspot.loop.control.configuration import RecordedControl, load_control, unpacked_control
 from faintspot.loop.control.identification.recording import (
@@ -32,7 +32,6 @@ from faintspot.loop.control.identification.recording import (
     rows_of_slopes,
 )
 from faintspot.loop.slope_covariance import ARCSEC
-from faintspot.loop.telemetry.recording import CLOSED
 from faintspot.slopes.recorded.stored_run import open_run
 from faintspot.slopes.sensor.pupil import side_m
 
@@ -164,7 +163,7 @@ def _of_store(path: Path, configuration: str | Path | None) -> dict[str, Any]:
     """Return the values of a recording of our own engine."""
     recording = read_telemetry(path, images=False)
     layout = recording.attributes["layout"]
-    closed = np.asarray(recording.loop) == CLOSED
+    closed = np.asarray(recording.loop) == CLOSED_LOOP
     rows = closed if closed.any() else np.ones(len(recording.frame), np.bool_)
     values: dict[str, Any] = {
         "slopes": recording.slopes[rows].astype(np.float64),

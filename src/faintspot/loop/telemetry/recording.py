@@ -8,6 +8,7 @@ import numpy as np
 
 from faintspot.base.arrays import Floats
 from faintspot.base.errors import InputError
+from faintspot.io.telemetry import CLOSED_LOOP
 from faintspot.loop.control.base import INTEGRATOR, KALMAN, split_control, without_prior
 from faintspot.loop.control.configuration import Control
 from faintspot.loop.control.identification.open_loop import FEWEST_FRAMES
@@ -19,10 +20,6 @@ from faintspot.slopes.sensor.pupil import side_m
 
 if TYPE_CHECKING:
     from faintspot.io.telemetry import Telemetry
-
-
-CLOSED = 2
-"""State of a closed loop in telemetry."""
 
 
 def recorded_loop(
@@ -61,7 +58,7 @@ def recorded_loop(
             "recording: expected a loop closed with an integrator, as the prior that another controller or "
             "program sent to the estimator was not recorded"
         )
-    rows, frame = np.asarray(recording.loop) == CLOSED, np.asarray(recording.frame)
+    rows, frame = np.asarray(recording.loop) == CLOSED_LOOP, np.asarray(recording.frame)
     if np.count_nonzero(rows) < FEWEST_FRAMES + options.delay_frames:
         raise InputError(
             f"recording: expected {FEWEST_FRAMES + options.delay_frames} frames with a closed loop, got "
