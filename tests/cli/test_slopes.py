@@ -37,7 +37,7 @@ def test_slopes_are_written_in_every_format(folder: Path, run: Commands, name: s
 def test_key_chooses_an_array_of_a_file(folder: Path, run: Commands) -> None:
     frames = simulated()
     np.savez("a.npz", night=frames, dark=frames[:3])
-    run.refused("slopes", "a.npz", "--key", "day", naming=("a.npz", "'day'", "night, dark"))
+    run.refused("slopes", "a.npz", "--key", "day", naming=("a.npz", "'day'", "night (30 x", "dark (3 x"))
     run.ok("slopes", "a.npz", "--key", "night", "-o", "s.npz")
     run.ok("slopes", "a.npz:night", "-o", "t.npz")
     for name in ("s.npz", "t.npz"):

@@ -68,7 +68,7 @@ class Source:
 
 
 def assert_same(found: fs.Slopes, expected: fs.Slopes) -> None:
-    for name, values in vars(expected).items():
+    for name, values in expected.variables.items():
         np.testing.assert_array_equal(getattr(found, name), values, err_msg=name)
 
 
