@@ -114,9 +114,7 @@ def test_names_in_docstrings_exist() -> None:
         modules |= {".".join(parts[i:]) for i in range(len(parts))}
         modules |= {".".join(parts[i:-1]) for i in range(len(parts) - 1)}
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-            names |= {
-                str(value) for name, value in ast.iter_fields(node) if name in ("name", "id", "attr", "arg")
-            }
+            names |= {str(getattr(node, field, None)) for field in ("name", "id", "attr", "arg")}
             if isinstance(node, ast.Constant) and isinstance(node.value, str):
                 if re.fullmatch(r"[\w.]+", node.value):
                     names.add(node.value)

@@ -107,6 +107,7 @@ def test_a_recording_draws_the_noise_of_x_and_y(axes: Axes) -> None:
     assert len(repr(recording)) < 300
 
 
+@pytest.mark.slow
 def test_a_study_draws_its_figures(axes: Axes) -> None:
     light = Sweep("light", flux_e=[30, 100, 300], pixels=8)
     specification = StudySpecification(
