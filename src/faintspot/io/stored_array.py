@@ -240,7 +240,7 @@ def arranged(array: StoredArray, time_axis: int | None) -> StoredArray:
     Parameters
     ----------
     array : StoredArray
-        Of any dimensions; axes of length one are dropped where there are more than three.
+        From `of_colours`.
     time_axis : {0, 1, 2}, optional
         Axis that counts the frames. Default: 0, or the one that is not of the length of the two others.
 
@@ -249,7 +249,6 @@ def arranged(array: StoredArray, time_axis: int | None) -> StoredArray:
     InputError
         If it is not clear which axis counts the frames.
     """
-    array = _without_ones(array)
     if len(array.shape) != 3:
         return array
     chosen = _time_axis(array) if time_axis is None else time_axis
@@ -355,6 +354,7 @@ def of_colours(array: StoredArray, channel: str | None) -> StoredArray:
     Parameters
     ----------
     array : StoredArray
+        Of any dimensions; axes of length one are dropped where there are more than three.
     channel : {"red", "green", "blue"}, optional
         Default: the colours are equal, which is found out while reading.
 

@@ -46,7 +46,7 @@ KIND = "study"
 
 @xarray.register_dataset_accessor("faintspot")  # type: ignore[no-untyped-call]
 class StudyFigures:
-    """What xarray's datasets of studies have under the name `faintspot`.
+    """Figures of a study, the accessor `faintspot` of its dataset.
 
     Parameters
     ----------

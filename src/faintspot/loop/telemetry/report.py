@@ -138,7 +138,7 @@ def report_of_loop(
     progress : callable
         Called with the name of each step.
     compare : bool
-        Whether other choices of control are replayed.
+        Whether other choices of control are replayed, and parts of the recording compared.
 
     Raises
     ------
@@ -147,7 +147,7 @@ def report_of_loop(
     """
     ready, report = _begun(loop)
     progress("delay")
-    delay = _loop(report)
+    delay = _loop(report, in_parts=compare)
     progress("noise")
     open_loop = _noise(report, delay)
     if open_loop is not None:
@@ -166,7 +166,7 @@ def report_of_loop(
 def noise_of_loop(loop: Recording) -> LoopReport:
     """Return a report with the noise alone; errors are those of `report_of_loop`."""
     _, report = _begun(loop)
-    _noise(report, _loop(report))
+    _noise(report, _loop(report, in_parts=True))
     return report
 
 
@@ -197,7 +197,7 @@ def _frames(report: LoopReport) -> None:
         report.doubts.append(_TEXT("doubts.missing", share=missing))
 
 
-def _loop(report: LoopReport) -> LoopDelay:
+def _loop(report: LoopReport, *, in_parts: bool) -> LoopDelay:
     """Return delay and gain; without commands those of an open loop."""
     loop, part = report.loop, report.parts["loop"]
     is_still = loop.commands is None or not np.ptp(loop.commands, axis=0).any()
@@ -210,12 +210,12 @@ def _loop(report: LoopReport) -> LoopDelay:
         why = f"The recording has no {absent}: its open-loop slopes are unknown."
         report.lack(why, ("loop", *_OF_TURBULENCE))
         return LoopDelay(1.0, 0.0, 1.0, 0.0)
-    values, delay = _delay(report)
+    values, delay = _delay(report, in_parts)
     part.values = [*values, *part.values]
     return delay
 
 
-def _delay(report: LoopReport) -> tuple[list[Measured], LoopDelay]:
+def _delay(report: LoopReport, in_parts: bool) -> tuple[list[Measured], LoopDelay]:
     """Return delay and gain as reported and as used."""
     loop = report.loop
     names, assumed = (("delay", "frames"), ("centroid gain", "")), loop.delay_frames
@@ -228,7 +228,7 @@ def _delay(report: LoopReport) -> tuple[list[Measured], LoopDelay]:
         report.doubts.append(_TEXT["doubts.delay"])
         remarks = f"{unknown}; {used.delay_frames:g} is used", f"{unknown}; 1 is used"
         return [Measured(*name, remark=text) for name, text in zip(names, remarks, strict=True)], used
-    report.doubts += _changes(fitted, used)
+    report.doubts += _changes(fitted) if in_parts else []
     remark = "given" if assumed is not None else f"{used.delay_frames:g} is used" if used is not fit else ""
     if not in_modes:
         used = with_axes_of(loop, used)
@@ -241,7 +241,7 @@ def _delay(report: LoopReport) -> tuple[list[Measured], LoopDelay]:
     return [Measured(*names[0], fit.delay_frames, fit.delay_error, remark), gain, axes], used
 
 
-def _changes(loop: Recording, delay: LoopDelay) -> list[str]:
+def _changes(loop: Recording) -> list[str]:
     """Return doubts whether one loop ran during the whole recording: its law, and its delay."""
     gains = gains_of_pieces(loop)
     if len(gains) and not (gains > _LEAST_GAIN).all():

@@ -38,7 +38,7 @@ _UNRELATED = 0.1  # coherence below which commands are not those of the loop
 _WINDOW, _SLOW, _INDEPENDENT = 64, 16, 0.75  # frames; part of them; part of half-overlapping pieces
 _IN_PHASE, _MOST_COMPARED = 0.4, 200  # part that tells the sign; slopes
 _STEPS_FOR_TEST = 200  # fewest of them
-_PIECES, _AT_ONCE = 8, 0  # in which commands are to follow slopes alike; lag of a prepared recording
+_PIECES = 8  # in which commands are to follow slopes alike
 _PER_FRAME = ("slopes", "commands", "frame", "standard_errors", "covariance_xy")
 OFFSETS = "reference_slopes", "flat_command"
 _ARRAYS = (
@@ -604,17 +604,19 @@ def gains_of_pieces(loop: Recording) -> Floats:
     commands are not those of an integrator.
     """
     loop = loop.part(np.isfinite(loop.slopes).any(axis=1))
+    axes = np.array_split(np.arange(loop.slopes.shape[1]), 1 if loop.cells is None else 2)
+    if len(loop.frame) < _PIECES * _WINDOW:
+        return np.zeros((0, len(axes)))
     controlled, caused = _controlled(loop)
-    axes = np.array_split(np.arange(controlled.shape[1]), 1 if loop.cells is None else 2)
     gains, correlations = [], []
     for rows in np.array_split(np.arange(len(loop.frame)), _PIECES):
         for columns in axes:
             part = np.ix_(rows, columns)
-            correlation, gain = _steps_on_slopes(controlled[part], caused[part], loop.frame[rows], _AT_ONCE)
+            correlation, gain = _steps_on_slopes(controlled[part], caused[part], loop.frame[rows], 0)
             correlations.append(abs(float(correlation[0])))
             gains.append(float(gain[0]))
     usual = float(np.median(gains))
-    if len(loop.frame) < _PIECES * _WINDOW or np.median(correlations) < _CLEAR or not usual:
+    if np.median(correlations) < _CLEAR or not usual:
         return np.zeros((0, len(axes)))
     return np.reshape(gains, (_PIECES, len(axes))) / usual
 
