@@ -1,8 +1,7 @@
 """Recorded telemetry, read from its store also while the engine runs; frame numbers left out."""
 
 import warnings
-from collections.abc import Collection, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -199,98 +198,56 @@ def read_telemetry(path: str | Path, *, images: bool = True) -> Telemetry:
     >>> recording = read_telemetry("night.zarr", images=False)  # doctest: +SKIP
     >>> recording.x.std(axis=0), recording.latency_s.max()  # doctest: +SKIP
     """
-    stored = _StoredTelemetry(path)
-    check_bytes(stored.path, stored.size(images=images), memory_bytes() // 2, "telemetry")
-    counts = {"frame": stored.frames, "image": stored.images if images else 0}
-    arrays = {name: stored.read(name, 0, counts[kind.dimensions[0]]) for name, kind in ARRAYS.items()}
-    return Telemetry(**arrays, changes=stored.changes, attributes=stored.attributes)
+    path = Path(path)
+    attributes = _attributes(path)
+    try:
+        return _read(path, attributes, images)
+    except InputError:
+        raise
+    except Exception as error:  # zarr raises many kinds of errors on broken stores
+        raise InputError(f"{path}: the store is damaged ({one_line(error)})") from None
 
 
-class _StoredTelemetry:
-    """A telemetry store at the time of opening, even while it is being written, read in parts.
+def _read(path: Path, attributes: dict[str, Any], images: bool) -> Telemetry:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of files that a recorder has not finished
+        stored = dict(open_store(path).arrays())
+    sizes = {"frame": int(attributes[FRAMES]), "image": int(attributes[IMAGES]) if images else 0}
+    sizes |= {"command": 0, "subaperture": stored["x"].shape[1]}
+    total = sum(array.nbytes for name, array in stored.items() if images or name not in ("raw", "denoised"))
+    check_bytes(path, total, memory_bytes() // 2, "telemetry")
+    arrays: dict[str, Any] = {}
+    for name, kind in ARRAYS.items():
+        length = sizes[kind.dimensions[0]]
+        if name not in stored and not kind.in_all:
+            arrays[name] = np.zeros([sizes[dimension] for dimension in kind.dimensions], kind.dtype)
+            continue
+        if length > stored[name].shape[0]:
+            raise InputError(f"{path}: the store is damaged ({name}: {stored[name].shape[0]} of {length})")
+        arrays[name] = np.asarray(read_items(path, stored[name], 0, length))
+    return Telemetry(**arrays, changes=attributes.pop("changes"), attributes=attributes)
 
-    Parameters
-    ----------
-    path : path
-        The Zarr store.
 
-    Attributes
-    ----------
-    path : Path
-    attributes : dict
-        See `Telemetry.attributes`.
-    changes : list of dict
-        See `Telemetry.changes`.
-    frames, images : int
-        Numbers of complete frames and images in the store.
+def _attributes(store: Path) -> dict[str, Any]:
+    """Return the attributes of a telemetry store.
 
     Raises
     ------
     InputError
-        When it is not a telemetry store, or damaged.
+        When it is something else.
     """
-
-    def __init__(self, path: str | Path) -> None:
-        self.path = Path(path)
-        self.attributes = self._attributes()
-        with self._damage():
-            self._group: Any = open_store(self.path)
-            self.frames, self.images = (int(self.attributes[name]) for name in (FRAMES, IMAGES))
-            self.changes: list[dict[str, Any]] = self.attributes.pop("changes")
-
-    def _attributes(self) -> dict[str, Any]:
-        """Return the attributes; refuse what is not a telemetry store."""
-        store = self.path
-        if not store.exists():
-            raise InputError(f"{store}: no such file or directory")
-        try:
-            attributes = stored_attributes(store)
-            is_telemetry = attributes["format"] == TELEMETRY and attributes["version"] == 1
-            if (store / CONTROL).is_dir():
-                attributes |= stored_attributes(store / CONTROL)
-        except (OSError, ValueError, KeyError, TypeError):
-            is_telemetry = False
-        if not (is_telemetry and is_store(store)):
-            raise InputError(f"{store}: expected a Zarr store of telemetry from `faintspot realtime record`")
-        return attributes
-
-    def __contains__(self, name: str) -> bool:
-        """Return whether the store has an array."""
-        return name in self._group
-
-    def size(self, *, images: bool) -> int:
-        """Return the bytes of all arrays in memory."""
-        with self._damage(), warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of files that a recorder has not finished
-            arrays = list(self._group.arrays())
-        left_out = () if images else ("raw", "denoised")
-        return sum(array.nbytes for name, array in arrays if name not in left_out)
-
-    def read(self, name: str, start: int, stop: int) -> NDArray[Any]:
-        """Return items `start` to `stop` of an array, by its name in `Telemetry`.
-
-        Raises
-        ------
-        InputError
-            When the store is damaged there.
-        """
-        count = stop - start
-        with self._damage():
-            if name not in self and not ARRAYS[name].in_all:
-                sizes = {"frame": count, "command": 0, "subaperture": self._group["x"].shape[1]}
-                shape = [sizes[dimension] for dimension in ARRAYS[name].dimensions]
-                return np.zeros(shape, ARRAYS[name].dtype)
-            array = self._group[name]
-        if stop > array.shape[0]:
-            raise InputError(f"{self.path}: the store is damaged ({name}: {array.shape[0]} of {stop})")
-        return np.asarray(read_items(self.path, array, start, stop))
-
-    @contextmanager
-    def _damage(self) -> Iterator[None]:
-        try:
-            yield
-        except Exception as error:  # zarr raises many kinds of errors on broken stores
-            raise InputError(f"{self.path}: the store is damaged ({one_line(error)})") from None
+    if not store.exists():
+        raise InputError(f"{store}: no such file or directory")
+    try:
+        attributes = stored_attributes(store)
+        is_telemetry = attributes["format"] == TELEMETRY and attributes["version"] == 1
+        if (store / CONTROL).is_dir():
+            attributes |= stored_attributes(store / CONTROL)
+    except (OSError, ValueError, KeyError, TypeError):
+        is_telemetry = False
+    if not (is_telemetry and is_store(store)):
+        raise InputError(f"{store}: expected a Zarr store of telemetry from `faintspot realtime record`")
+    return attributes
 
 
 def stored_names(kind: np.dtype[np.void]) -> list[str]:
