@@ -24,6 +24,7 @@ from faintspot.loop.control.identification.learning import learn_controller, rel
 from faintspot.loop.control.identification.modal_model import LoopOfControl
 from faintspot.loop.control.identification.model import Kalman
 from faintspot.loop.control.identification.predictive_control import PredictiveControl
+from faintspot.loop.control.identification.recording import LoopSystem
 from faintspot.loop.control.integrator import CompiledIntegrator, LoopPlant
 from faintspot.loop.control.kalman.compiled import CompiledKalman, Predictive
 from faintspot.loop.control.kalman.local_model import neighbours_within
@@ -225,8 +226,10 @@ def _control(across: int, rng: np.random.Generator) -> tuple[PredictiveControl, 
     arrays = dense if m <= _MOST_SLOPES else random_filter(cells, rng)
     model = Kalman(arrays, 0.3, 1.0, (1.0, 2.0), np.eye(commands))
     measured = np.array([2.0, 0.1, 1.0, 0.1, 1.0, 0.1])
-    numbers = measured, np.zeros((0, 6)), np.ones(commands), 0.3, 0
-    loop = _RandomLoop(interaction, np.ones(m), np.ones(m), 1.0, *numbers)
+    numbers = measured, np.zeros((0, 6)), np.ones(commands), 0.3
+    offsets: dict[str, Any] = {"reference_slopes": np.zeros(m), "flat_command": np.zeros(commands)}
+    system = LoopSystem(interaction, cells, 1000.0, **offsets)
+    loop = _RandomLoop(system, interaction, np.ones(m), np.ones(m), *numbers)
     return PredictiveControl(loop, model), np.asarray(0.1 * rng.standard_normal(m))
 
 

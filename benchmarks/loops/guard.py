@@ -24,7 +24,8 @@ from faintspot.loop.control.identification.learnt_loop import ObservedLoop, lear
 from faintspot.loop.control.identification.loop_delay import LoopDelay
 from faintspot.loop.control.identification.open_loop import open_loop_of
 from faintspot.loop.control.identification.predictive_control import PredictiveControl, learn
-from faintspot.loop.control.identification.recording import Recording, prepared
+from faintspot.loop.control.identification.preparation import prepared
+from faintspot.loop.control.identification.recording import Recording
 from faintspot.loop.control.reconstructor import make_reconstructor
 from faintspot.loop.slope_covariance import ARCSEC
 from faintspot.slopes.spots.shapes import R0_WAVELENGTH_M, SPECTRUM

@@ -9,7 +9,8 @@ from tests.loop.telemetry.loop_cases import AIR, CELLS, CORNERS, NOISE_PX, RATE_
 from tests.patience import mostly_slow
 
 from faintspot.base.errors import InputError
-from faintspot.loop.control.identification.recording import Recording, prepared
+from faintspot.loop.control.identification.preparation import prepared
+from faintspot.loop.control.identification.recording import Recording
 from faintspot.loop.simulation import LoopConfiguration
 from faintspot.loop.simulation.atmosphere import make_atmosphere
 from faintspot.loop.simulation.record import slope_turbulence

@@ -30,8 +30,9 @@ class Controls(RuleBasedStateMachine):
 
     def __init__(self) -> None:
         super().__init__()
-        offsets = replace(self.learnt._loop, reference_slopes=REFERENCE, flat_command=FLAT)
-        loop = replace(offsets, largest_command=np.full(2, LIMIT))
+        loop = self.learnt._loop
+        recorded = replace(loop.recorded, reference_slopes=REFERENCE, flat_command=FLAT)
+        loop = replace(loop, recorded=recorded, largest_command=np.full(2, LIMIT))
         self.control = PredictiveControl(loop, self.learnt.model)
         self.copy: PredictiveControl | None = None
         self.last = REFERENCE

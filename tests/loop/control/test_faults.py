@@ -12,7 +12,8 @@ from tests.patience import mostly_slow
 from faintspot.base.errors import InputError
 from faintspot.loop.control.base import CommandDelayLine
 from faintspot.loop.control.faults import STUCK_FRAMES, StuckWatch, followers, still_actuators
-from faintspot.loop.control.identification.recording import Recording, prepared
+from faintspot.loop.control.identification.preparation import prepared
+from faintspot.loop.control.identification.recording import Recording
 from faintspot.loop.control.kalman.compiled import CompiledKalman
 from faintspot.loop.control.kalman.predictor import SlopePredictor
 

@@ -8,7 +8,8 @@ import pytest
 from tests.loop.telemetry.loop_cases import NOISE_PX, recorded
 from tests.refusals import refused
 
-from faintspot.loop.control.identification.recording import Recording, gains_of_pieces, prepared
+from faintspot.loop.control.identification.preparation import gains_of_pieces, prepared
+from faintspot.loop.control.identification.recording import Recording
 from faintspot.loop.telemetry.report import noise_of_loop
 
 FRAMES = 1600

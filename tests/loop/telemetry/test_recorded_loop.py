@@ -19,7 +19,8 @@ from faintspot.base.flags import SubapertureFlag
 from faintspot.engine.telemetry.recorder import TelemetryStore
 from faintspot.io import create_writer, read_telemetry, write_aot
 from faintspot.io.telemetry import item_type
-from faintspot.loop.control.identification.recording import NUMBERS, Recording, prepared
+from faintspot.loop.control.identification.preparation import prepared
+from faintspot.loop.control.identification.recording import NUMBERS, Recording
 from faintspot.loop.telemetry.page import page_of_loop
 from faintspot.loop.telemetry.recorded_loop import frame_rate, read_recorded_loop
 from faintspot.loop.telemetry.report import report_of_loop

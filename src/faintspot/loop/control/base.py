@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, ClassVar, NamedTuple, Protocol
 
 import numpy as np
@@ -238,8 +238,8 @@ class OpenLoopTelemetry:
 
     def part(self, start: int, stop: int | None) -> OpenLoopTelemetry:
         """Return a selection of frames."""
-        arrays = {name: array for name, array in vars(self).items() if array is not None}
-        return OpenLoopTelemetry(**{name: array[start:stop] for name, array in arrays.items()})
+        arrays = {name: array[start:stop] for name, array in vars(self).items() if array is not None}
+        return replace(self, **arrays)
 
     @property
     def covariances_px2(self) -> Floats:
@@ -250,13 +250,8 @@ class OpenLoopTelemetry:
 
     def scaled(self, noise_factor: float) -> OpenLoopTelemetry:
         """Return the same telemetry with the noise scaled."""
-        covariance = self.covariance_xy_px2
-        return OpenLoopTelemetry(
-            self.open_loop_px,
-            self.variance_px2 * noise_factor,
-            self.trust,
-            None if covariance is None else covariance * noise_factor,
-        )
+        covariance = self.covariances_px2 * noise_factor
+        return replace(self, variance_px2=self.variance_px2 * noise_factor, covariance_xy_px2=covariance)
 
 
 def without_prior(

@@ -26,13 +26,8 @@ from faintspot.loop.control.identification.open_loop import (
     site_of_loop,
     with_axes_of,
 )
-from faintspot.loop.control.identification.recording import (
-    Prepared,
-    Recording,
-    gains_of_pieces,
-    order_doubt,
-    prepared,
-)
+from faintspot.loop.control.identification.preparation import Prepared, gains_of_pieces, order_doubt, prepared
+from faintspot.loop.control.identification.recording import Recording
 from faintspot.loop.slope_covariance import ARCSEC
 from faintspot.loop.telemetry.spectra import (
     ModalSpectra,

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import ArrayLike
 from tests.loop.control.control_cases import CELLS, INTERACTION, LAYERS, PHASE_OF_COMMANDS
 from tests.loop.control.modal_cases import commands_of_matrices
 from tests.loop.telemetry.loop_cases import recorded
@@ -16,7 +17,7 @@ from faintspot.loop.control.identification import predictive_control
 from faintspot.loop.control.identification.modal_model import LoopOfControl
 from faintspot.loop.control.identification.model import Kalman
 from faintspot.loop.control.identification.predictive_control import PredictiveControl, learn
-from faintspot.loop.control.identification.recording import Recording
+from faintspot.loop.control.identification.recording import LoopSystem, Recording
 
 GAIN = 0.5
 
@@ -158,16 +159,20 @@ def test_learn_again_continues(control: PredictiveControl, recording: Recording)
     np.testing.assert_allclose(control(recording.slopes[50]), sent, atol=0.5 * np.abs(sent).max())
 
 
-def made(sign: float = 1.0, **options: Any) -> PredictiveControl:
+def made(
+    sign: float = 1.0, reference: ArrayLike = 0.0, flat: ArrayLike = 0.0, **options: Any
+) -> PredictiveControl:
     """Return a controller of 9 sub-apertures with a gain of 0.4; `sign` is that of the user's commands."""
     residual, variance = 1.0, np.ones(18)
     arrays = {"first": 0.9 * LAYERS.first, "second": LAYERS.second, "driving_px2": LAYERS.driving}
     arrays |= {"variance_px2": variance, "covariance_xy_px2": np.zeros(9)}
     model = Kalman(arrays, 0.4, 1.0, (residual, residual), PHASE_OF_COMMANDS)
     gains = np.array([2.0, 0.0, 1.0, 0.0, 1.0, 0.0])
-    numbers = gains, np.zeros((0, 6)), np.full(12, 10.0), 0.4, 1
+    offsets: dict[str, Any] = {"reference_slopes": np.full(18, reference), "flat_command": np.full(12, flat)}
+    recorded = LoopSystem(INTERACTION, CELLS, 250.0, command_sign=sign, **offsets)
+    numbers = gains, np.zeros((0, 6)), np.full(12, 10.0), 0.4
     return PredictiveControl(
-        LoopOfControl(INTERACTION, np.ones(18), np.ones(18), sign, *numbers, **options), model
+        LoopOfControl(recorded, INTERACTION, np.ones(18), np.ones(18), *numbers, **options), model
     )
 
 
@@ -201,7 +206,7 @@ def test_commands_are_about_the_flat_one_and_slopes_about_their_references(
     """Stroke included: 55 of 100 leaves 45 either way. 1e-9: sums with the offsets are rounded."""
     rng = np.random.default_rng(1)
     reference, flat = rng.standard_normal(18), np.linspace(45.0, 65.0, 12)
-    offset, plain = made(sign, reference_slopes=reference, flat_command=flat), made(sign)
+    offset, plain = made(sign, reference, flat), made(sign)
     offset.save(tmp_path / "offset.npz")
     rows = rng.standard_normal((70, 18))
     for held in (np.zeros(12), rng.standard_normal(12)):
@@ -219,7 +224,7 @@ def test_commands_are_about_the_flat_one_and_slopes_about_their_references(
 
 def test_a_row_of_zeros_is_not_measured() -> None:
     """With references it would be slopes of minus these."""
-    zero, missing = (made(reference_slopes=np.full(18, 0.5)) for _ in range(2))
+    zero, missing = (made(reference=np.full(18, 0.5)) for _ in range(2))
     for row in np.random.default_rng(1).standard_normal((5, 18)):
         zero(row), missing(row)
     np.testing.assert_array_equal(zero(np.zeros(18)), missing(np.full(18, np.nan)))

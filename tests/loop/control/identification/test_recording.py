@@ -12,7 +12,8 @@ from tests.refusals import refused
 from faintspot.base.errors import InputError
 from faintspot.loop.control.identification.loop_delay import LoopDelay
 from faintspot.loop.control.identification.open_loop import known_delay, open_loop_of
-from faintspot.loop.control.identification.recording import Recording, prepared
+from faintspot.loop.control.identification.preparation import prepared
+from faintspot.loop.control.identification.recording import Recording
 
 
 def later(loop: Recording, frames: int) -> Recording:

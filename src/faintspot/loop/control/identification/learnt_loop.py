@@ -27,7 +27,8 @@ from faintspot.loop.control.identification.open_loop import (
     winds_of,
     with_axes_of,
 )
-from faintspot.loop.control.identification.recording import Prepared, Recording, prepared
+from faintspot.loop.control.identification.preparation import Prepared, prepared
+from faintspot.loop.control.identification.recording import Recording
 from faintspot.loop.control.integrator import LoopPlant
 
 _MOST_SIGMAS = 5.0  # of the commands that the turbulence asks for
@@ -124,22 +125,19 @@ def _observed(ready: Prepared) -> ObservedLoop:
 def _with_winds(observed: ObservedLoop, start: Identified | None) -> tuple[LoopOfControl, Kalman]:
     """Learn the filter of winds, for the interaction matrix as given."""
     ready, delay, seen = observed.ready, observed.delay, observed.seen
-    loop, site = ready.recording, site_of_loop(ready.recording)
-    gains, unit = delay.gains(len(loop.cells)), site.length_unit
-    error = np.sqrt(seen.variance)
+    loop, error = ready.recording, np.sqrt(seen.variance)
     described = LoopOfControl.of(
         ready,
         delay,
         loop.interaction_matrix,
         error,
-        gains,
-        length_unit=unit,
+        delay.gains(len(loop.cells)),
         recorded_interaction=observed.recorded_interaction,
     )
     learnt = learn_controller(
         described.plant(),
         seen.telemetry,
-        site,
+        site_of_loop(loop),
         loop.frame_rate_hz,
         start=start,
         identification=observed.identification,

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, Self
 
@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.arrays import Floats
-from faintspot.base.errors import InputError
 from faintspot.base.files import read_arrays
 from faintspot.loop.control.base import OpenLoopTelemetry
 from faintspot.loop.control.identification.layers import Identification
@@ -24,7 +23,8 @@ from faintspot.loop.control.identification.modal_delay import (
 )
 from faintspot.loop.control.identification.model import Kalman
 from faintspot.loop.control.identification.open_loop import OpenLoop, of_modes, open_loop_of, site_of_loop
-from faintspot.loop.control.identification.recording import Prepared, Recording
+from faintspot.loop.control.identification.preparation import Prepared
+from faintspot.loop.control.identification.recording import LoopSystem, Recording
 from faintspot.loop.control.integrator import LoopPlant
 from faintspot.loop.control.kalman.modal_predictor import (
     LAGS,
@@ -36,29 +36,20 @@ from faintspot.loop.control.kalman.predictor import LARGEST_VARIANCE_PX2
 from faintspot.loop.control.reconstructor import make_reconstructor
 
 _LEAK = 0.01
-_RECORDED = (
-    "interaction_matrix",
-    "cells",
-    "frame_rate_hz",
-    "subaperture_m",
-    "pixel_scale_arcsec",
-    "outer_scale_m",
-)
-"""Fields of the recorded loop in files."""
 
 
 @dataclass(frozen=True, eq=False)
 class LoopOfControl:
     """Loop of a controller, with conversions from the user's unit and sign."""
 
+    recorded: LoopSystem
+    """Recorded system in the user's units and sign; its `reference_slopes` and `flat_command` are 0 here."""
     interaction: Floats
     """(2 n, commands): in slopes divided by the rms of the recording's and by their centroid gain."""
     standard_error: Floats
     """(2 n,): of such slopes; infinite where the recording has none, which are left out."""
     scale: Floats
     """(2 n,): such slopes in a unit of the user's."""
-    sign: float
-    """-1 where the user's commands are subtracted from the turbulence."""
     delay: Floats
     """(6,): delay in frames, centroid gain, and that of x relative to y, each with its standard error."""
     winds: Floats
@@ -66,23 +57,14 @@ class LoopOfControl:
     largest_command: Floats
     """(commands,): stroke limit about the flat command."""
     integrator_gain: float
-    sent_after_frames: int
     recorded_gain: float = math.nan
     """Gain of the recorded integrator on the controller's slopes, if the fallback has another one."""
-    length_unit: str = "m"
-    """Unit of length of the winds."""
     law: str = ""
     """Name of the law by which the recorded loop ran."""
     analysis: Floats = field(default_factory=lambda: np.zeros((0, 0)))
     """(modes, m): matrix from such slopes to modes, of which `interaction` then has a row each; or empty."""
     recorded_interaction: Floats = field(default_factory=lambda: np.zeros((0, 0)))
     """(2 n, commands): `interaction` before it was corrected, for the fallback; or empty."""
-    reference_slopes: Floats = field(default_factory=lambda: np.zeros(1))
-    """(m,) or (1,): slopes that are 0 here, in the user's unit."""
-    flat_command: Floats = field(default_factory=lambda: np.zeros(1))
-    """(commands,) or (1,): command that is 0 here, in the user's unit."""
-    recorded: Recording | None = None
-    """A frame of the recorded loop, in the user's units: what learning again must know."""
 
     @classmethod
     def of(
@@ -108,75 +90,67 @@ class LoopOfControl:
             Other fields.
         """
         loop = ready.recording
+        recorded = replace(
+            loop.system.scaled(1 / loop.unit),
+            command_sign=ready.sign,
+            sent_after_frames=ready.sent_after_frames,
+            reference_slopes=ready.reference_slopes,
+            flat_command=ready.flat_command,
+        )
         return cls(
+            recorded,
             matrix,
             np.where(np.isfinite(loop.slopes).any(axis=0), error, np.inf),
             1 / (loop.unit * gains),
-            ready.sign,
             delay.row(),
             np.zeros((0, 6)),
             np.full(matrix.shape[1], math.inf),
             math.nan,
-            ready.sent_after_frames,
-            reference_slopes=ready.reference_slopes,
-            flat_command=ready.flat_command,
-            recorded=loop.part(slice(0, 1)).scaled(1 / loop.unit),
             **options,
         )
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Return the loop as arrays by their names in files, see `read`."""
         values = {f"loop_{name}": value for name, value in vars(self).items() if name != "recorded"}
-        if self.recorded is not None:
-            values |= {f"recorded_{name}": getattr(self.recorded, name) for name in _RECORDED}
+        values |= {f"recorded_{name}": value for name, value in vars(self.recorded).items()}
         return {name: np.asarray(value) for name, value in values.items() if value is not None}
 
     @classmethod
     def read(cls, path: str | Path, contents: str) -> Self:
-        """Read the loop from the file of a controller; the recorded loop has a frame of zeros.
+        """Read the loop from the file of a controller.
 
         Raises
         ------
         InputError
             When it cannot be read; it names the contents.
         """
-        own = tuple(f"loop_{name}" for name in cls.__dataclass_fields__ if name != "recorded")
-        optional = tuple(f"recorded_{name}" for name in _RECORDED)
-        arrays = read_arrays(path, contents, (*own, *optional), optional=optional)
-        values: dict[str, Any] = {
-            name: array.item() if array.ndim == 0 else array for name, array in arrays.items()
-        }
-        loop = cls(**{name.removeprefix("loop_"): values[name] for name in own})
-        known: dict[str, Any] = {name: values.get(f"recorded_{name}") for name in _RECORDED}
-        if known["interaction_matrix"] is None:
-            return loop
-        slopes, commands = np.atleast_2d(known["interaction_matrix"]).shape
-        frame: dict[str, Any] = {"slopes": np.zeros((1, slopes)), "commands": np.zeros((1, commands))}
-        return replace(loop, recorded=Recording(**frame, **known))
+        own = {f"loop_{item.name}": item.name for item in fields(cls)[1:]}
+        of_system = {f"recorded_{item.name}": item.name for item in fields(LoopSystem)}
+        arrays = read_arrays(path, contents, (*own, *of_system), optional=tuple(of_system)[1:])
+        values = {name: array.item() if array.ndim == 0 else array for name, array in arrays.items()}
+        system: dict[str, Any] = {name: values.get(stored) for stored, name in of_system.items()}
+        return cls(LoopSystem(**system), **{name: values[stored] for stored, name in own.items()})
+
+    @property
+    def sign(self) -> float:
+        """-1 where the user's commands are subtracted from the turbulence."""
+        return self.recorded.command_sign or 1.0
 
     def scaled_slopes(self, slopes: Floats) -> Floats:
         """Return slopes of this loop from the user's."""
-        return (slopes - self.reference_slopes) * self.scale
+        return np.asarray((slopes - self.recorded.reference_slopes) * self.scale)
 
     def sent(self, command: Floats) -> Floats:
         """Return the user's command from one of this loop."""
-        return self.sign * command + self.flat_command
+        return np.asarray(self.sign * command + self.recorded.flat_command)
 
     def held(self, command: Floats) -> Floats:
         """Return the command of this loop from the user's."""
-        return self.sign * (command - self.flat_command)
+        return np.asarray(self.sign * (command - self.recorded.flat_command))
 
     @property
     def slopes_of_commands(self) -> Floats:
-        """(m, commands): the user's matrix in such slopes.
-
-        Raises
-        ------
-        InputError
-            When the file of the controller has no recorded loop.
-        """
-        if self.recorded is None:
-            raise InputError("controller: expected the recorded loop in its file; learn from a recording")
+        """(m, commands): the user's matrix in such slopes."""
         scale = float(np.exp(np.log(np.abs(self.scale)).mean())) * float(self.delay[2])
         return np.asarray(scale * self.recorded.interaction_matrix)
 

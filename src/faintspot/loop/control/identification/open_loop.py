@@ -21,7 +21,7 @@ from faintspot.loop.control.identification.loop_delay import (
     with_axes,
 )
 from faintspot.loop.control.identification.modal_delay import ModalFits, plateau
-from faintspot.loop.control.identification.recording import Recording
+from faintspot.loop.control.identification.recording import LoopSystem, Recording
 from faintspot.loop.control.identification.slope_noise import noise_of_slopes
 from faintspot.loop.slope_covariance import OUTER_SCALE_M, SlopeTurbulence
 from faintspot.loop.turbulence_strength import TurbulenceStrength
@@ -58,11 +58,15 @@ class OpenLoop:
         return replace(self, telemetry=scaled, residual=residual, variance=gain**2 * self.variance)
 
 
-def site_of_loop(loop: Recording) -> SlopeTurbulence:
+def site_of_loop(loop: LoopSystem) -> SlopeTurbulence:
     """Return the geometry; an unknown pixel scale is 1 arcsec, an unknown sub-aperture the unit of length."""
-    unit = "m" if loop.subaperture_m else "sub-apertures"
     side, scale = loop.subaperture_m or 1.0, loop.pixel_scale_arcsec or 1.0
-    return SlopeTurbulence.unmeasured(loop.cells, side, scale, loop.outer_scale_m, unit)
+    return SlopeTurbulence.unmeasured(loop.cells, side, scale, loop.outer_scale_m, length_unit(loop))
+
+
+def length_unit(loop: LoopSystem) -> str:
+    """Return the unit of lengths of the turbulence."""
+    return "m" if loop.subaperture_m else "sub-apertures"
 
 
 def runs_of(frame: NDArray[np.int64]) -> NDArray[np.int64]:

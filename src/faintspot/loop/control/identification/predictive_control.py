@@ -33,8 +33,8 @@ from faintspot.loop.control.identification.loop_delay import LoopDelay
 from faintspot.loop.control.identification.modal_delay import LEAST_MEASURED
 from faintspot.loop.control.identification.modal_model import LoopOfControl
 from faintspot.loop.control.identification.model import Kalman, state_space, write_matrices
-from faintspot.loop.control.identification.open_loop import Measured, Wind, open_loop_of
-from faintspot.loop.control.identification.recording import Recording
+from faintspot.loop.control.identification.open_loop import Measured, Wind, length_unit, open_loop_of
+from faintspot.loop.control.identification.recording import OFFSETS, Recording
 
 Singles = NDArray[np.float32]
 
@@ -90,7 +90,8 @@ class PredictiveControl:
     @property
     def winds(self) -> tuple[Wind, ...]:
         """Layers that were found, the strongest first; none if the filter knows no winds."""
-        return tuple(Wind.of(row, f"{self._loop.length_unit}/s") for row in self._loop.winds)
+        unit = length_unit(self._loop.recorded)
+        return tuple(Wind.of(row, f"{unit}/s") for row in self._loop.winds)
 
     @property
     def integrator_gain(self) -> float:
@@ -105,7 +106,6 @@ class PredictiveControl:
     @relearn.setter
     def relearn(self, when: str) -> None:
         self._relearn = one_of("relearn", when, ["", "background"])
-        _ = self._loop.slopes_of_commands  # refused here rather than in the loop
 
     @property
     def is_predicting(self) -> bool:
@@ -233,29 +233,12 @@ class PredictiveControl:
         loop = self._loop
         slopes, commands = self._recent.latest(frames)
         scale: Singles = np.where(np.isfinite(loop.standard_error), loop.scale, np.nan).astype(np.float32)
-        return (slopes / scale + loop.reference_slopes).astype(np.float32), commands
+        return (slopes / scale + loop.recorded.reference_slopes).astype(np.float32), commands
 
     def recording_of(self, slopes: ArrayLike, commands: ArrayLike) -> Recording:
-        """Return frames of this controller's loop, (frames, m) and (frames, commands), as a recording.
-
-        Raises
-        ------
-        InputError
-            When the controller comes from a file without the recorded loop.
-        """
-        if self._loop.recorded is None:
-            raise InputError("controller: expected the recorded loop in its file; learn from a recording")
-        delay = float(self._plant.delay_frames)
-        return replace(
-            self._loop.recorded,
-            slopes=slopes,
-            commands=commands,
-            frame=None,
-            reference_slopes=self._loop.reference_slopes,
-            flat_command=self._loop.flat_command,
-            delay_frames=delay,
-            sent_after_frames=0,
-        )
+        """Return frames of this controller's loop, (frames, m) and (frames, commands), as a recording."""
+        system = {**vars(self._loop.recorded), "delay_frames": float(self._plant.delay_frames)}
+        return Recording(slopes, commands, **{**system, "sent_after_frames": 0})
 
     def better_of(self, recording: Recording) -> tuple[PredictiveControl | None, str]:
         """Learn from the first part of a recording, and compare with this controller on the rest, by replay.
@@ -298,7 +281,7 @@ class PredictiveControl:
 
     def _in_loop_of(self, loop: LoopOfControl) -> Callable[[Floats], Floats]:
         """Return this controller for the slopes and commands of a description of the same loop."""
-        return lambda slopes: loop.held(self(slopes / loop.scale + loop.reference_slopes))
+        return lambda slopes: loop.held(self(slopes / loop.scale + loop.recorded.reference_slopes))
 
     def _take(self, better: PredictiveControl) -> None:
         """Continue with another controller from the mirror's command."""
@@ -349,7 +332,7 @@ class PredictiveControl:
                 self._take(better)
             return self
         if recording.sent_after_frames is None:
-            recording = replace(recording, sent_after_frames=self._loop.sent_after_frames)
+            recording = replace(recording, sent_after_frames=self._loop.recorded.sent_after_frames)
         again = learn(recording, self.model.identified)
         self._take(again)
         self._eased = again._eased
@@ -401,9 +384,8 @@ class PredictiveControl:
         plant, loop = self._plant, self._loop
         scale = loop.analysis * loop.scale if loop.analysis.size else loop.scale
         matrices = state_space(self.model, plant, scale, loop.sign)
-        matrices["delay_frames"] = np.array(plant.delay_frames)
-        for name in ("largest_command", "reference_slopes", "flat_command"):
-            matrices[name] = np.asarray(getattr(loop, name))
+        matrices |= {name: getattr(loop.recorded, name) for name in OFFSETS}
+        matrices |= {"delay_frames": np.array(plant.delay_frames), "largest_command": loop.largest_command}
         write_matrices(path, matrices)
 
     def summary(self) -> str:

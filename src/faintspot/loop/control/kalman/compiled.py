@@ -28,7 +28,6 @@ from faintspot.loop.control.kalman.kernels import (
     Lines,
     Matrices,
     Memory,
-    Recorded,
     replay,
 )
 from faintspot.loop.control.kalman.predictor import SlopePredictor, shares
@@ -153,11 +152,10 @@ class CompiledKalman(GuardedController):
         """
         squares = np.zeros(len(telemetry))
         variance = np.maximum(self._noise_factor * telemetry.variance_px2, LEAST_VARIANCE_PX2)
-        slopes, trust = telemetry.open_loop_px, telemetry.trust
         covariance = self._noise_factor * telemetry.covariances_px2
         self._memory.state[:], self._memory.slopes[PREDICTED] = 0.0, 0.0
         line = np.zeros_like(self._rows.learnt)
-        recorded = Recorded(slopes, variance, covariance, trust)
+        recorded = telemetry.open_loop_px, variance, covariance, telemetry.trust
         gain, keep, largest, steps = self._numbers
         numbers = gain, keep, np.full_like(largest, np.inf), steps
         replay(recorded, numbers, self._matrices, line, self._memory, squares)

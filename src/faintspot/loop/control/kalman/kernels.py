@@ -95,19 +95,6 @@ class Frame(NamedTuple):
     """Factor on the errors' variances."""
 
 
-class Recorded(NamedTuple):
-    """Recorded frames; see `OpenLoopTelemetry`."""
-
-    open_loop: Any
-    """(frames, m) float64"""
-    variance: Any
-    """(frames, m) float64"""
-    covariance: Any
-    """(frames, m / 2) float64"""
-    trust: Any
-    """(frames, m) float64"""
-
-
 # Compiled anew when guard or integrator change, too.
 _SOURCES = __file__, guard_rule.__file__, integrator.__file__
 _compiled = partial(_kernel, sources=tuple(map(Path, _SOURCES)))
@@ -364,7 +351,8 @@ def replay(recorded: Any, numbers: Any, matrices: Any, line: Any, memory: Any, s
 
     Parameters
     ----------
-    recorded : Recorded
+    recorded : tuple
+        Open-loop slopes, their variance, covariance of x and y, and trust; see `OpenLoopTelemetry`.
     numbers, matrices
         As for `follow`.
     line : (delay + 1, commands) float64 array
