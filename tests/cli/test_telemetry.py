@@ -63,7 +63,7 @@ def test_methods_that_alternated_are_compared(folder: Path, run: Commands) -> No
     loop = known.loop
     layout = Layout.grid((SIDE, SIDE), pixels=8, pixel_scale_arcsec=PIXEL_ARCSEC, subaperture_m=SUBAPERTURE_M)
     write_recording(
-        folder / "night.zarr", layout, loop.slopes_px, loop.commands, loop.method, ("none", "tv:0.6"), MATRIX
+        folder / "night.zarr", layout, loop.slopes, loop.commands, loop.method, ("none", "tv:0.6"), MATRIX
     )
     told = run.ok("telemetry", "night.zarr")
     assert "estimated from slopes" in told.out

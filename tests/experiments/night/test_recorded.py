@@ -51,7 +51,7 @@ def stored(
 ) -> Path:
     loop = known.loop
     return write_recording(
-        folder / "night.zarr", layout, loop.slopes_px, loop.commands, loop.method, methods, MATRIX,
+        folder / "night.zarr", layout, loop.slopes, loop.commands, loop.method, methods, MATRIX,
         rate_hz=RATE_HZ, options=OPTIONS, **options,
     )  # fmt: skip
 

@@ -73,15 +73,16 @@ def alternating(
     loop = AlternatingLoop(
         slopes.astype(np.float32),
         commands[DELAY:].astype(np.float32),
-        np.arange(frames),
-        np.arange(frames) / RATE_HZ,
-        method,
-        np.zeros(frames, np.int64),
         MATRIX,
-        DELAY,
         CELLS,
-        SUBAPERTURE_M,
-        PIXEL_ARCSEC,
+        RATE_HZ,
+        frame=np.arange(frames),
+        time_s=np.arange(frames) / RATE_HZ,
+        method=method,
+        conditions=np.zeros(frames, np.int64),
+        delay_frames=DELAY,
+        subaperture_m=SUBAPERTURE_M,
+        pixel_scale_arcsec=PIXEL_ARCSEC,
     )
     per_px = PIXEL_ARCSEC * ARCSEC * SUBAPERTURE_M
     phase = true @ (per_px * residual_phase(reconstructor.clean, MATRIX, CELLS)).T

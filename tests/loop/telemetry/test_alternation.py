@@ -51,7 +51,7 @@ def test_residual_phase_is_the_true_one(gains: tuple[float, float]) -> None:
 def test_a_turn_of_which_too_little_was_measured_has_no_phase() -> None:
     loop = alternating(400).loop
     turn = turns_of(loop, SETTLE)[2]
-    loop.slopes_px[turn.scored : turn.end, :26] = np.nan
+    loop.slopes[turn.scored : turn.end, :26] = np.nan
     assert phase_of_turn(loop, turn, 1.0) is None
 
 
@@ -59,7 +59,7 @@ def test_slopes_that_were_not_measured_do_not_count() -> None:
     known = alternating(1000)
     turns = turns_of(known.loop, SETTLE)
     before = np.mean([each.variance_m2 for turn in turns if (each := phase_of_turn(known.loop, turn, 1.0))])
-    known.loop.slopes_px[np.random.default_rng(2).random(known.loop.slopes_px.shape) < 0.02] = np.nan
+    known.loop.slopes[np.random.default_rng(2).random(known.loop.slopes.shape) < 0.02] = np.nan
     after = np.mean([each.variance_m2 for turn in turns if (each := phase_of_turn(known.loop, turn, 1.0))])
     assert after == pytest.approx(before, rel=0.1)
 

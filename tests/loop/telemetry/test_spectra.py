@@ -10,7 +10,7 @@ from tests.patience import mostly_slow
 
 from faintspot.loop.control.identification.layers import Identification
 from faintspot.loop.control.identification.loop_delay import LoopDelay
-from faintspot.loop.control.identification.open_loop import Measured, open_loop_of, site_of_loop
+from faintspot.loop.control.identification.open_loop import Measured, open_loop_of
 from faintspot.loop.control.identification.vibrations import MODES
 from faintspot.loop.telemetry.spectra import OTHERS, modal_spectra, recorded_discrepancy
 
@@ -23,7 +23,7 @@ def found(change: np.ndarray, missing: float = 0.0) -> list[Measured]:
     slopes[:, np.random.default_rng(1).random(slopes.shape[1]) < missing] = np.nan
     loop = replace(loop, slopes=slopes, interaction_matrix=whole @ loop.interaction_matrix)
     seen = open_loop_of(loop, LoopDelay(2.0, 0.0, 1.0, 0.0))
-    identified = Identification(seen.telemetry, site_of_loop(loop), loop.frame_rate_hz)
+    identified = Identification(seen.telemetry, loop.site, loop.frame_rate_hz)
     return recorded_discrepancy(loop, seen, identified.of_winds(np.zeros((1, 2))))
 
 
@@ -44,7 +44,7 @@ def test_too_few_slopes() -> None:
     slopes = np.full_like(loop.slopes, np.nan)
     slopes[:, [0, 25]] = loop.slopes[:, [0, 25]]
     seen = open_loop_of(replace(loop, slopes=slopes), LoopDelay(2.0, 0.0, 1.0, 0.0))
-    identified = Identification(seen.telemetry, site_of_loop(loop), loop.frame_rate_hz)
+    identified = Identification(seen.telemetry, loop.site, loop.frame_rate_hz)
     for each in recorded_discrepancy(loop, seen, identified.of_winds(np.zeros((1, 2)))):
         assert not np.isfinite(each.value)
         assert "too few" in each.remark
@@ -57,7 +57,7 @@ def test_a_spectrum_is_variance_by_frequency() -> None:
     noise = np.random.default_rng(1).normal(0.0, 0.2, seen.open_loop_px.shape)
     measured = np.tile(np.isin(np.arange(25), [6, 8, 16, 18]), 2)
     telemetry = replace(seen, open_loop_px=noise, variance_px2=np.where(measured, seen.variance_px2, np.inf))
-    identified = Identification(telemetry, site_of_loop(loop), loop.frame_rate_hz)
+    identified = Identification(telemetry, loop.site, loop.frame_rate_hz)
     spectra = modal_spectra(telemetry, identified.of_winds(np.zeros((1, 2))))
     for name in (*MODES, OTHERS):
         density = spectra.measured[name].mean()  # known to 4 % from 1500 frames

@@ -40,7 +40,7 @@ from faintspot.loop.telemetry.alternation import (
     turns_of,
 )
 from faintspot.loop.telemetry.choices import unseen_m2
-from faintspot.loop.telemetry.recorded_loop import control_of, system_numbers
+from faintspot.loop.telemetry.recorded_loop import control_of, frame_rate, system_numbers
 from faintspot.slopes.sensor.pupil import side_m
 
 SCIENCE_WAVELENGTH_M = 1.65e-6
@@ -138,16 +138,17 @@ def _loop(
     return AlternatingLoop(
         np.where(np.tile(telemetry.valid, 2), telemetry.slopes, np.nan),
         telemetry.commands,
-        telemetry.frame,
-        telemetry.unix_time_s,
-        np.where(telemetry.loop == CLOSED_LOOP, methods.number[telemetry.method], -1),
-        conditions_of(telemetry)[0],
         control.interaction,
-        control.options.delay_frames,
         cells,
-        float(side),
-        float(scale),
-        values.get("outer_scale_m"),
+        frame_rate(telemetry.unix_time_s, telemetry.frame),
+        frame=telemetry.frame,
+        time_s=telemetry.unix_time_s,
+        method=np.where(telemetry.loop == CLOSED_LOOP, methods.number[telemetry.method], -1),
+        conditions=conditions_of(telemetry)[0],
+        delay_frames=control.options.delay_frames,
+        subaperture_m=side,
+        pixel_scale_arcsec=scale,
+        outer_scale_m=values.get("outer_scale_m"),
     )
 
 
@@ -290,7 +291,7 @@ def _column(
     error = float(
         np.sqrt(np.square(frames * [scored.phase.error_m2 for scored in block]).sum()) / frames.sum()
     )
-    phase = wave * (residual + unseen_m2(loop.subaperture_m, r0[0]))
+    phase = wave * (residual + unseen_m2(loop.site.subaperture_m, r0[0]))
     middles = [float(loop.time_s[turn.scored : turn.end].mean()) for turn in turns]
     duration = float(frames.sum()) / loop.frame_rate_hz
     relative_error = float(relative.error[method] / relative.gain[method])

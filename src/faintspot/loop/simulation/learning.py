@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 
 from faintspot.base.errors import InputError
-from faintspot.loop.control.base import INTEGRATOR, OpenLoopTelemetry, without_prior
+from faintspot.loop.control.base import INTEGRATOR, OpenLoopTelemetry
 from faintspot.loop.control.identification.learning import learn_controller
 from faintspot.loop.control.identification.loop_delay import LoopDelay
 from faintspot.loop.control.identification.model import Kalman
-from faintspot.loop.control.identification.open_loop import measured_delay, open_loop_of
+from faintspot.loop.control.identification.open_loop import freed_of_prior, measured_delay, open_loop_of
 from faintspot.loop.control.identification.recording import Recording
 from faintspot.loop.simulation.configuration import LoopConfiguration
 from faintspot.loop.simulation.methods import PRIOR, TRUE, Method
@@ -133,17 +133,9 @@ def recorded_loop(record: LoopRecord, method: Method) -> Recording:
     """Return what a telescope records of a run of one method with the integrator, freed of its prior."""
     loop = record.loop
     delay = loop.control.delay_frames
-    sent = record.commands[delay:].astype(np.float64)  # computed from each frame
-    slopes, errors = (
-        values[: len(sent)].astype(np.float64) for values in (record.slopes_px, record.standard_error_px)
-    )
-    expected, prior = np.zeros_like(slopes), method.prior_std_px(slopes.shape[1])
-    if method.is_predicted:  # what acts less the latest command, which acts so many frames later
-        acting = record.commands.astype(np.float64) @ record.interaction_matrix.T
-        expected = acting[: len(sent)] - acting[delay - 1 :][: len(sent)]
-    slopes, variance, _ = without_prior(slopes, errors, expected, prior)
+    sent = record.commands[delay:]  # computed from each frame
     recording = Recording(
-        np.where(np.isfinite(variance), slopes, np.nan),
+        record.slopes_px[: len(sent)],
         sent,
         record.interaction_matrix,
         record.cells,
@@ -151,12 +143,12 @@ def recorded_loop(record: LoopRecord, method: Method) -> Recording:
         subaperture_m=loop.subaperture_m,
         pixel_scale_arcsec=loop.pixel_scale_rad / ARCSEC,
         delay_frames=delay,
-        standard_errors=np.sqrt(variance),
-        covariance_xy=record.covariance_xy_px2[: len(sent)].astype(np.float64),
-        prior_std=prior,
+        standard_errors=record.standard_error_px[: len(sent)],
+        covariance_xy=record.covariance_xy_px2[: len(sent)],
+        prior_std=method.prior_std_px(len(record.interaction_matrix)),
         slope_unit="px",
     )
-    return recording.part(slice(_SETTLE_FRAMES, None))
+    return freed_of_prior(recording, is_predicted=method.is_predicted).part(slice(_SETTLE_FRAMES, None))
 
 
 def _without_assumed(configuration: LoopConfiguration) -> LoopConfiguration:

@@ -7,7 +7,7 @@ time.
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
 from functools import cached_property
 from itertools import pairwise
 
@@ -16,65 +16,44 @@ from numpy.typing import NDArray
 
 from faintspot.base.arrays import Floats
 from faintspot.loop.control.flattening import residual_phase
+from faintspot.loop.control.identification.recording import LoopFrames, LoopSystem
 from faintspot.loop.control.identification.slope_noise import SlopeNoise, noise_of_slopes
 from faintspot.loop.control.reconstructor import make_reconstructor
-from faintspot.loop.slope_covariance import ARCSEC, SlopeTurbulence
-from faintspot.loop.telemetry.recorded_loop import frame_rate
 
 FEWEST_SCORED = 5
 """Frames of a turn after settling, of which a residual phase is computed."""
 _FEWEST_MEASURED = 0.5  # of a frame's slopes, for the frame to count
 
 
-@dataclass(frozen=True, eq=False)
-class AlternatingLoop:
-    """Recording of a closed loop with n sub-apertures, whose methods took turns."""
+@dataclass(frozen=True, eq=False, repr=False)
+class AlternatingLoop(LoopSystem, LoopFrames):
+    """Frames of float32 of a loop with n sub-apertures, whose methods took turns; numbers may begin anew."""
 
-    slopes_px: NDArray[np.float32]
-    """(frames, 2 n): all x, then all y; NaN where not measured."""
-    commands: NDArray[np.float32]
-    """(frames, commands): those computed from each frame."""
-    frame: NDArray[np.int64]
-    """(frames,): numbers of the frames; missing ones were lost."""
+    _: KW_ONLY
     time_s: Floats
     """(frames,): times at which their last rows arrived."""
     method: NDArray[np.int64]
     """(frames,): number of the method; negative where the loop was open."""
     conditions: NDArray[np.int64]
     """(frames,): number of the conditions, such as settings that all methods share."""
-    interaction: Floats
-    """(2 n, commands): slopes [px] for a unit of each command."""
-    delay_frames: int
-    """The command computed from frame k acts first during frame k + delay."""
-    cells: NDArray[np.int64]
-    """(n, 2): row and column of each sub-aperture."""
-    subaperture_m: float
-    pixel_scale_arcsec: float
-    outer_scale_m: float | None = None
-
-    @cached_property
-    def frame_rate_hz(self) -> float:
-        """See `frame_rate`."""
-        return frame_rate(self.time_s, self.frame)
-
-    @property
-    def site(self) -> SlopeTurbulence:
-        """Geometry and outer scale."""
-        scale = self.pixel_scale_arcsec
-        return SlopeTurbulence.unmeasured(self.cells, self.subaperture_m, scale, self.outer_scale_m)
 
     @cached_property
     def phase(self) -> Floats:
         """(commands, 2 n): from slopes [px] to amplitudes [m] whose squares add up to the variance."""
-        reconstructor = make_reconstructor(self.interaction)
-        per_px = self.pixel_scale_arcsec * ARCSEC * self.subaperture_m
-        return per_px * residual_phase(reconstructor.clean, self.interaction, self.cells)
+        matrix, site = self.interaction_matrix, self.site
+        per_px = site.pixel_scale_rad * site.subaperture_m
+        return per_px * residual_phase(make_reconstructor(matrix).clean, matrix, self.cells)
+
+    @property
+    def delay(self) -> int:
+        """Whole frames."""
+        return int(self.delay_frames or 0)
 
     def mirror(self, rows: NDArray[np.int64]) -> Floats:
         """Return the slopes of the mirror in some frames, NaN where its commands were not recorded."""
-        sent = rows - self.delay_frames
-        held = self.commands[np.maximum(sent, 0)].astype(np.float64) @ self.interaction.T
-        known = (sent >= 0) & (self.frame[rows] - self.frame[np.maximum(sent, 0)] == self.delay_frames)
+        sent = rows - self.delay
+        held = self.commands[np.maximum(sent, 0)].astype(np.float64) @ self.interaction_matrix.T
+        known = (sent >= 0) & (self.frame[rows] - self.frame[np.maximum(sent, 0)] == self.delay)
         return np.where(known[:, None], held, np.nan)
 
 
@@ -140,7 +119,7 @@ def phase_of_turn(loop: AlternatingLoop, turn: Turn, gain: float) -> TurnPhase |
         Centroid gain of the turn's method.
     """
     rows = np.arange(turn.begin, turn.end)
-    residual = loop.slopes_px[rows].astype(np.float64) / gain
+    residual = loop.slopes[rows].astype(np.float64) / gain
     variance, error, shared_error = _noise(residual - loop.mirror(rows), loop.frame[rows])
     scored = residual[turn.scored - turn.begin :]
     share = np.isfinite(scored).mean(axis=1)
@@ -171,7 +150,7 @@ def open_loop_slopes(
     atmosphere, residual, run = [], [], []
     for number, turn in enumerate(turns):
         rows = np.arange(turn.begin, turn.end)
-        slopes = loop.slopes_px[rows].astype(np.float64) / gains[turn.method]
+        slopes = loop.slopes[rows].astype(np.float64) / gains[turn.method]
         open_loop = slopes - loop.mirror(rows)
         known = np.isfinite(open_loop).any(axis=1)
         atmosphere.append(open_loop[known])
@@ -241,7 +220,7 @@ def relative_gains(
 
 def _follows(loop: AlternatingLoop, before: Turn, after: Turn) -> bool:
     """Return whether a turn directly follows another one, without a lost frame near the change."""
-    first = after.begin - _FRAMES_BEFORE - loop.delay_frames
+    first = after.begin - _FRAMES_BEFORE - loop.delay
     return (
         before.end == after.begin
         and before.conditions == after.conditions
@@ -282,9 +261,9 @@ def _features(loop: AlternatingLoop, rows: NDArray[np.int64]) -> tuple[Floats, F
 
     Slopes that were not measured are 0; NaN where the mirror is not known.
     """
-    slopes = np.nan_to_num(loop.slopes_px[rows].astype(np.float64))
+    slopes = np.nan_to_num(loop.slopes[rows].astype(np.float64))
     before = [
-        np.nan_to_num(loop.slopes_px[rows - lag].astype(np.float64)) for lag in range(1, _FRAMES_BEFORE + 1)
+        np.nan_to_num(loop.slopes[rows - lag].astype(np.float64)) for lag in range(1, _FRAMES_BEFORE + 1)
     ]
     mirror = [loop.mirror(rows - lag) for lag in range(_FRAMES_BEFORE + 1)]
     return slopes, np.stack([*before, *mirror], axis=-1)

@@ -9,9 +9,9 @@ import numpy as np
 from faintspot.base.arrays import Floats
 from faintspot.base.errors import InputError
 from faintspot.io.telemetry import CLOSED_LOOP
-from faintspot.loop.control.base import INTEGRATOR, KALMAN, split_control, without_prior
+from faintspot.loop.control.base import INTEGRATOR, KALMAN, split_control
 from faintspot.loop.control.configuration import Control
-from faintspot.loop.control.identification.open_loop import FEWEST_FRAMES
+from faintspot.loop.control.identification.open_loop import FEWEST_FRAMES, freed_of_prior
 from faintspot.loop.control.identification.recording import Recording
 from faintspot.loop.control.options import NONE, STREAM
 from faintspot.loop.slope_covariance import SlopeTurbulence
@@ -69,17 +69,10 @@ def recorded_loop(
     errors = np.where(invalid, np.inf, errors) / options.centroid_gain
     if not np.isfinite(errors).any():
         raise InputError("recording: expected standard errors of slopes; give the calibration a read noise")
-    slopes = recording.slopes[rows].astype(np.float64) / options.centroid_gain
-    commands = recording.commands[rows].astype(np.float64)
-    expected = np.zeros_like(slopes)
-    if predicted:  # what acts less the latest command
-        mirror, delay = commands @ control.interaction.T, options.delay_frames
-        expected[delay:] = mirror[:-delay] - mirror[delay - 1 : -1]
-    slopes, variance, _ = without_prior(slopes, errors, expected, prior_std_px)
     times, frames = recording.last_row_time_ns[rows], frame[rows]
-    return Recording(
-        np.where(np.isfinite(variance), slopes, np.nan),
-        commands,
+    loop = Recording(
+        recording.slopes[rows].astype(np.float64) / options.centroid_gain,
+        recording.commands[rows],
         control.interaction,
         layout.cells,
         float(frames[-1] - frames[0]) / max(float(times[-1] - times[0]) / 1e9, 1e-9),
@@ -87,11 +80,12 @@ def recorded_loop(
         pixel_scale_arcsec=layout.pixel_scale_arcsec,
         delay_frames=options.delay_frames,
         frame=frames,
-        standard_errors=np.sqrt(variance),
+        standard_errors=errors,
         covariance_xy=recording.covariance_xy[rows].astype(np.float64) / options.centroid_gain**2,
         prior_std=prior_std_px,
         slope_unit="px",
     )
+    return freed_of_prior(loop, is_predicted=predicted)
 
 
 def site_of(layout: Layout) -> SlopeTurbulence:

@@ -23,7 +23,6 @@ from faintspot.loop.control.identification.open_loop import (
     known_delay,
     measured_delay,
     open_loop_of,
-    site_of_loop,
     with_axes_of,
 )
 from faintspot.loop.control.identification.preparation import Prepared, gains_of_pieces, order_doubt, prepared
@@ -317,7 +316,7 @@ def _noise(report: LoopReport, delay: LoopDelay) -> OpenLoop | None:
 def _turbulence(report: LoopReport, open_loop: OpenLoop, delay: LoopDelay) -> Identification | None:
     """Report the turbulence; return its identification, None if it is unknown."""
     loop = report.loop
-    part, site = report.parts["turbulence"], site_of_loop(loop)
+    part, site = report.parts["turbulence"], loop.site
     try:
         identification = Identification(open_loop.telemetry, site, loop.frame_rate_hz)
         identified = identification.layers()
@@ -389,7 +388,7 @@ def _choices(report: LoopReport, open_loop: OpenLoop, delay: LoopDelay) -> None:
     turbulence = report.parts["turbulence"].values
     r0 = next((value for value in turbulence if value.name == R0), Measured(R0, "m"))
     try:
-        report.choices = compared_choices(loop, open_loop, delay, site_of_loop(loop), r0, report.turbulence)
+        report.choices = compared_choices(loop, open_loop, delay, loop.site, r0, report.turbulence)
     except InputError as error:
         part.missing = str(error)
 

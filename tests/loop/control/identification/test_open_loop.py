@@ -15,15 +15,14 @@ from faintspot.loop.control.identification.loop_delay import LoopDelay
 from faintspot.loop.control.identification.open_loop import (
     measured_delay,
     open_loop_of,
-    site_of_loop,
     winds_of,
 )
 from faintspot.loop.control.identification.recording import Recording
 
 
 def test_an_unknown_sub_aperture_is_the_unit_of_length() -> None:
-    assert site_of_loop(recorded()).length_unit == "m"
-    site = site_of_loop(replace(recorded(), subaperture_m=None))
+    assert recorded().site.length_unit == "m"
+    site = replace(recorded(), subaperture_m=None).site
     assert (site.subaperture_m, site.length_unit) == (1.0, "sub-apertures")
 
 

@@ -11,7 +11,6 @@ from tests.refusals import refused
 from faintspot.loop.control.base import OpenLoopTelemetry
 from faintspot.loop.control.identification.learning import GAINS, learn_controller
 from faintspot.loop.control.identification.loop_delay import DelayFits
-from faintspot.loop.control.identification.open_loop import site_of_loop
 from faintspot.loop.control.identification.recording import Recording
 from faintspot.loop.control.integrator import LoopPlant
 from faintspot.loop.control.reconstructor import make_reconstructor
@@ -23,7 +22,7 @@ _TURBULENCE, _VIBRATION, _BROAD = (
     oscillator(45.0, 0.3, 0.4),
 )
 _CELLS = np.zeros((1, 2), np.int64)
-_SITE = site_of_loop(Recording(np.zeros((1, 2)), None, None, _CELLS, _RATE_HZ))
+_SITE = Recording(np.zeros((1, 2)), None, None, _CELLS, _RATE_HZ).site
 
 
 def _seen(seed: int) -> NDArray[np.float64]:

@@ -23,7 +23,6 @@ from faintspot.loop.control.identification.open_loop import (
     OpenLoop,
     measured_delay,
     open_loop_of,
-    site_of_loop,
     winds_of,
     with_axes_of,
 )
@@ -137,7 +136,7 @@ def _with_winds(observed: ObservedLoop, start: Identified | None) -> tuple[LoopO
     learnt = learn_controller(
         described.plant(),
         seen.telemetry,
-        site_of_loop(loop),
+        loop.site,
         loop.frame_rate_hz,
         start=start,
         identification=observed.identification,

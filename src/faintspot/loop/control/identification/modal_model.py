@@ -22,9 +22,9 @@ from faintspot.loop.control.identification.modal_delay import (
     spectra_of_modes,
 )
 from faintspot.loop.control.identification.model import Kalman
-from faintspot.loop.control.identification.open_loop import OpenLoop, of_modes, open_loop_of, site_of_loop
+from faintspot.loop.control.identification.open_loop import OpenLoop, of_modes, open_loop_of
 from faintspot.loop.control.identification.preparation import Prepared
-from faintspot.loop.control.identification.recording import LoopSystem, Recording
+from faintspot.loop.control.identification.recording import LoopSystem
 from faintspot.loop.control.integrator import LoopPlant
 from faintspot.loop.control.kalman.modal_predictor import (
     LAGS,
@@ -174,7 +174,6 @@ class LoopInModes:
 
     described: LoopOfControl
     seen: OpenLoop
-    rate_hz: float
 
     @classmethod
     def of(cls, ready: Prepared, delay: LoopDelay) -> Self:
@@ -194,7 +193,7 @@ class LoopInModes:
             law=law_of(delay.gain * in_modes, sent, run),
             analysis=modes.analysis,
         )
-        return cls(described, open_loop_of(modes.recording, replace(delay, gain=1.0)), loop.frame_rate_hz)
+        return cls(described, open_loop_of(modes.recording, replace(delay, gain=1.0)))
 
 
 Kind = Callable[[Kalman, LoopPlant, OpenLoopTelemetry, LoopInModes], Kalman]
@@ -265,8 +264,9 @@ def _autoregressions(
 
 def _oscillators(model: Kalman, plant: LoopPlant, telemetry: OpenLoopTelemetry, loop: LoopInModes) -> Kalman:
     """Return the filter of two modes as of tip and tilt of a single sub-aperture."""
-    single = Recording(np.zeros((1, 2)), None, None, np.zeros((1, 2)), loop.rate_hz)
-    fit = Identification(telemetry, site_of_loop(single), loop.rate_hz).layers()
+    rate_hz = loop.described.recorded.frame_rate_hz
+    single = LoopSystem(None, np.zeros((1, 2)), rate_hz)
+    fit = Identification(telemetry, single.site, rate_hz).layers()
     return model.learnt(plant, telemetry, [fit])
 
 

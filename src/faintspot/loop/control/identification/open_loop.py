@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from faintspot.base.arrays import Floats
 from faintspot.base.errors import InputError
-from faintspot.loop.control.base import OpenLoopTelemetry
+from faintspot.loop.control.base import OpenLoopTelemetry, without_prior
 from faintspot.loop.control.identification.layers import Identified
 from faintspot.loop.control.identification.loop_delay import (
     GAINS,
@@ -21,7 +21,7 @@ from faintspot.loop.control.identification.loop_delay import (
     with_axes,
 )
 from faintspot.loop.control.identification.modal_delay import ModalFits, plateau
-from faintspot.loop.control.identification.recording import LoopSystem, Recording
+from faintspot.loop.control.identification.recording import Recording
 from faintspot.loop.control.identification.slope_noise import noise_of_slopes
 from faintspot.loop.slope_covariance import OUTER_SCALE_M, SlopeTurbulence
 from faintspot.loop.turbulence_strength import TurbulenceStrength
@@ -56,17 +56,6 @@ class OpenLoop:
         slopes = telemetry.open_loop_px + residual - self.residual
         scaled = replace(telemetry.scaled(gain**2), open_loop_px=slopes)
         return replace(self, telemetry=scaled, residual=residual, variance=gain**2 * self.variance)
-
-
-def site_of_loop(loop: LoopSystem) -> SlopeTurbulence:
-    """Return the geometry; an unknown pixel scale is 1 arcsec, an unknown sub-aperture the unit of length."""
-    side, scale = loop.subaperture_m or 1.0, loop.pixel_scale_arcsec or 1.0
-    return SlopeTurbulence.unmeasured(loop.cells, side, scale, loop.outer_scale_m, length_unit(loop))
-
-
-def length_unit(loop: LoopSystem) -> str:
-    """Return the unit of lengths of the turbulence."""
-    return "m" if loop.subaperture_m else "sub-apertures"
 
 
 def runs_of(frame: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -115,7 +104,7 @@ def _of_fit(loop: Recording) -> tuple[Floats, Floats, NDArray[np.int64], SlopeTu
     InputError
         When no frame has most of the slopes.
     """
-    site, measured = site_of_loop(loop), np.isfinite(loop.slopes)
+    site, measured = loop.site, np.isfinite(loop.slopes)
     part = measured.mean(axis=0).reshape(2, -1).min(axis=0)
     kept = np.flatnonzero((part > 0) & (part >= _LEAST_MEASURED * part.max()))
     columns = np.concatenate([kept, kept + len(loop.cells)])
@@ -166,6 +155,25 @@ def known_delay(loop: Recording) -> tuple[LoopDelay, LoopDelay, str]:
         return *measured_delay(loop), ""
     except InputError as error:
         return assumed, assumed, str(error)
+
+
+def freed_of_prior(loop: Recording, *, is_predicted: bool) -> Recording:
+    """Return a loop without the estimator's prior, which has drawn slopes towards the expected ones.
+
+    Parameters
+    ----------
+    loop : Recording
+        With standard errors, the delay, and `prior_std` where there was a prior.
+    is_predicted : bool
+        Whether slopes were expected that the latest command takes away; else 0.
+    """
+    expected, delay = np.zeros_like(loop.slopes), int(loop.delay_frames or 1)
+    if is_predicted:
+        mirror = loop.commands @ loop.interaction_matrix.T
+        expected[delay:] = mirror[:-delay] - mirror[delay - 1 : -1]
+    slopes, variance, _ = without_prior(loop.slopes, loop.standard_errors, expected, loop.prior_std)
+    slopes = np.where(np.isfinite(variance), slopes, np.nan)
+    return replace(loop, slopes=slopes, standard_errors=np.sqrt(variance))
 
 
 def open_loop_of(loop: Recording, delay: LoopDelay) -> OpenLoop:

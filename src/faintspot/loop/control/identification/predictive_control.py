@@ -33,7 +33,7 @@ from faintspot.loop.control.identification.loop_delay import LoopDelay
 from faintspot.loop.control.identification.modal_delay import LEAST_MEASURED
 from faintspot.loop.control.identification.modal_model import LoopOfControl
 from faintspot.loop.control.identification.model import Kalman, state_space, write_matrices
-from faintspot.loop.control.identification.open_loop import Measured, Wind, length_unit, open_loop_of
+from faintspot.loop.control.identification.open_loop import Measured, Wind, open_loop_of
 from faintspot.loop.control.identification.recording import OFFSETS, Recording
 
 Singles = NDArray[np.float32]
@@ -90,8 +90,8 @@ class PredictiveControl:
     @property
     def winds(self) -> tuple[Wind, ...]:
         """Layers that were found, the strongest first; none if the filter knows no winds."""
-        unit = length_unit(self._loop.recorded)
-        return tuple(Wind.of(row, f"{unit}/s") for row in self._loop.winds)
+        recorded = self._loop.recorded
+        return tuple(Wind.of(row, f"{recorded.site.length_unit}/s") for row in self._loop.winds)
 
     @property
     def integrator_gain(self) -> float:

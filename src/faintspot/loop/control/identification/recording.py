@@ -19,6 +19,7 @@ from faintspot.base.checks import (
 )
 from faintspot.base.errors import InputError, drawn
 from faintspot.base.options import Option
+from faintspot.loop.slope_covariance import SlopeTurbulence
 
 OFFSETS = "reference_slopes", "flat_command"
 _OF_SLOPES = {
@@ -124,6 +125,13 @@ class LoopSystem:
         values["prior_std"] = _array("prior_std", self.prior_std, is_positive=True)
         values |= {name: _array(name, getattr(self, name), is_finite=True) for name in OFFSETS}
         vars(self).update(values)
+
+    @property
+    def site(self) -> SlopeTurbulence:
+        """Geometry; an unknown pixel scale is 1 arcsec, an unknown sub-aperture the unit of length."""
+        unit = "m" if self.subaperture_m else "sub-apertures"
+        side, scale = self.subaperture_m or 1.0, self.pixel_scale_arcsec or 1.0
+        return SlopeTurbulence.unmeasured(self.cells, side, scale, self.outer_scale_m, unit)
 
     def scaled(self, unit: float) -> Self:
         """Return the same with slopes in another unit, so many of the present one."""
