@@ -77,7 +77,7 @@ class Task:
 TASKS = {
     "SlopePipeline, one TV frame": Task(_FRAME, 8_000),
     "slopes of a recording": Task(_SLOPES, 11_000, (_FRAMES, _LAYOUT)),
-    "telemetry": Task("telemetry slopes.zarr --frame-rate-hz 250", 13_000, (_FRAMES, _LAYOUT, _SLOPES)),
+    "telemetry": Task("telemetry slopes.zarr --frame-rate-hz 250", 12_200, (_FRAMES, _LAYOUT, _SLOPES)),
     "loop magnitude": Task(
         "loop magnitude small.toml --quick --methods brightest --flux-e 20 --workers 0",
         15_700,

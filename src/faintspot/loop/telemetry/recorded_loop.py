@@ -1,10 +1,12 @@
 """Recorded loop of any system, read from its file."""
 
+from __future__ import annotations
+
 import math
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,12 +20,9 @@ from faintspot.base.text_files import check_keys, parse_file
 from faintspot.io import StoredSlopes
 from faintspot.io.fits_units import is_aot
 from faintspot.io.frames import read_array
-from faintspot.io.loop_layouts import read_layout
 from faintspot.io.loop_streams import holds_session, holds_streams, read_session, read_streams
 from faintspot.io.slopes import holds_slopes
-from faintspot.io.telemetry import CLOSED_LOOP, read_telemetry
 from faintspot.io.zarr_store import holds_telemetry
-from faintspot.loop.control.configuration import RecordedControl, load_control, unpacked_control
 from faintspot.loop.control.identification.recording import (
     NUMBERS,
     OFFSETS,
@@ -34,6 +33,9 @@ from faintspot.loop.control.identification.recording import (
 from faintspot.loop.slope_covariance import ARCSEC
 from faintspot.slopes.recorded.stored_run import open_run
 from faintspot.slopes.sensor.pupil import side_m
+
+if TYPE_CHECKING:
+    from faintspot.loop.control.configuration import RecordedControl
 
 UNITS = {"px": None, "arcsec": 1.0, "rad": 1 / ARCSEC}
 """Units of slopes, in arcsec."""
@@ -118,6 +120,8 @@ def _values_of(path: Path, configuration: str | Path | None, named: dict[str, st
     elif path.is_file() and is_aot(path):
         values = _of_aot(path) | {"origin": "AOT file"}
     else:
+        from faintspot.io.loop_layouts import read_layout  # only for such files
+
         return read_layout(path, named)
     return values | {name: read_array(text) for name, text in named.items()} | {"sources": named}
 
@@ -161,6 +165,8 @@ def _of_table(path: Path) -> dict[str, Any]:
 
 def _of_store(path: Path, configuration: str | Path | None) -> dict[str, Any]:
     """Return the values of a recording of our own engine."""
+    from faintspot.io.telemetry import CLOSED_LOOP, read_telemetry
+
     recording = read_telemetry(path, images=False)
     layout = recording.attributes["layout"]
     closed = np.asarray(recording.loop) == CLOSED_LOOP
@@ -198,6 +204,8 @@ def control_of(
     InputError
         When either cannot be understood.
     """
+    from faintspot.loop.control.configuration import RecordedControl, load_control, unpacked_control
+
     if configuration is None:
         return unpacked_control(attributes)
     control = load_control(configuration)
