@@ -7,10 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from tests.loop.control.frozen_flow import frozen_slopes
-from tests.loop.control.identification.test_predictive_control import made
 from tests.loop.telemetry.loop_cases import AIR, NOISE_PX, RATE_HZ, recorded
 
-from faintspot.base.errors import InputError
 from faintspot.loop.control.base import OpenLoopTelemetry
 from faintspot.loop.control.identification.learning import (
     FRAMES,
@@ -59,15 +57,6 @@ def test_residual_of_an_integrator_in_a_replay() -> None:
     telemetry = OpenLoopTelemetry(open_loop, np.ones((50, 2)), np.ones((50, 2)))
     left = replayed_slopes(control, telemetry, matrix, 2)
     np.testing.assert_allclose(left, expected, rtol=0.01)
-
-
-def test_a_controller_without_its_loop_cannot_learn_again() -> None:
-    control = made()
-    for ask in (control.learn_again, lambda: setattr(control, "relearn", "background")):
-        with pytest.raises(InputError, match="expected the recorded loop"):
-            ask()
-    with pytest.raises(InputError, match="relearn"):
-        control.relearn = "sometimes"
 
 
 @pytest.mark.slow
