@@ -106,6 +106,7 @@ OF_OTHERS = {
 """Names in docstrings that are Python's, or those of tools that adapters serve."""
 
 
+@pytest.mark.slow
 def test_names_in_docstrings_exist() -> None:
     """Between single backquotes: modules, and what some module defines, takes or uses."""
     root, modules, names, cited = Path(faintspot.__file__).parent, set[str](), set(OF_OTHERS), []

@@ -285,7 +285,7 @@ class TestLocalBackground:
         source = pipeline.source(frame, frame.dtype)
 
         def job(start: int, stop: int, scratch: Scratch) -> None:
-            pipeline.plan.flux_kernel(source.frames)(source, start, stop, scratch, flux)
+            pipeline.plan.flux_kernel(source, start, stop, scratch, flux)
 
         run_groups(job, -(-40 // pipeline.width), source.lanes, (12, 12))
         assert flux.mean() == pytest.approx(500.0, rel=0.1)

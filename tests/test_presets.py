@@ -36,6 +36,7 @@ def cell(read_noise_e: float, flux_e: float, profile: str = "diffraction", size:
     return Cell(flux_e, read_noise_e, profile, size, 1.0, 16, 1.0, 0.0, 1.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("case", "keep"),
     mostly_slow(1, [(cell(3.0, 80), 12), (cell(0.1, 30), 11), (cell(0.1, 30, "gaussian"), 16)]),

@@ -65,7 +65,6 @@ class Sensor:
         folder: Path,
         name: str,
         *,
-        pixels: tuple[str, ...] = ("uint16",),
         library: Path | None = None,
     ) -> "Sensor":
         """Simulate frames, and export."""
@@ -89,7 +88,7 @@ class Sensor:
         }
         library = KERNELS if library is None else library
         libraries = {
-            key: export_library(pipeline, library, f"{name}_{key}", cpus=[native_target()], pixels=pixels)
+            key: export_library(pipeline, library, f"{name}_{key}", cpus=[native_target()])
             for key, pipeline in pipelines.items()
         }
         return cls(layout, frames, truth, pipelines, libraries, folder / f"{name}.raw")

@@ -2,7 +2,7 @@
  *
  * Parameters of DARC's buffer, all optional but the first one:
  *   slopeParams   path of a bundle that `faintspot export library` wrote; another one takes its place
- *   fsImages      int: 0: DARC's raw pixels (uint16); 1: images of the calibrate module (--pixels images)
+ *   fsImages      int: 0: DARC's raw pixels (uint16); 1: images of the calibrate module
  *   fsStrength, fsTolerance (float), fsIterations (int): one number, or one for each sub-aperture in use;
  *                 `noise_std`, `tolerance` and `max_iterations` of the TV denoising
  *   refCentroids  subtracted

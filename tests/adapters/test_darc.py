@@ -21,7 +21,7 @@ LAYOUT = fs.Layout.grid((7, 7), pixels=16, outer_radius=3.5, inner_radius=0.5)
 @pytest.fixture(scope="module")
 def sensor(tmp_path_factory: pytest.TempPathFactory) -> Sensor:
     folder = tmp_path_factory.mktemp("frames")
-    return Sensor.of(LAYOUT, folder, "sensor", pixels=("uint16", "images"), library=CACHE)
+    return Sensor.of(LAYOUT, folder, "sensor", library=CACHE)
 
 
 @pytest.fixture(scope="module")

@@ -48,17 +48,13 @@ class TestBundle:
                 export_library(pipeline, tmp_path)
         with pytest.raises(InputError):
             export_library(pipeline_of("centroid"), tmp_path, cpus=["z80"])
-        with pytest.raises(InputError):
-            export_library(pipeline_of("centroid"), tmp_path, pixels=["int8"])
         assert not list(tmp_path.rglob("*.o"))
 
-    def test_fingerprints_differ_with_kernel_types_and_processor(self) -> None:
-        variants = [Variant.of(pipeline_of("centroid"), "uint16", width) for width in (4, 8)]
-        variants.append(Variant.of(pipeline_of("centroid"), "float32", 8))
-        calls = [variant.measure for variant in variants]
+    def test_fingerprints_differ_with_width_and_processor_alone(self) -> None:
+        calls = [Variant.of(pipeline_of("centroid"), "uint16", width).measure for width in (4, 8)]
         keys = {fingerprint(call.kernel, call.kinds, cpu) for call in calls for cpu in TARGETS}
-        assert len(keys) == 3 * len(TARGETS)
-        same = Variant.of(pipeline_of("brightest"), "uint16", 8).measure
+        assert len(keys) == 2 * len(TARGETS)
+        same = Variant.of(pipeline_of("brightest"), "images", 8).measure
         assert fingerprint(same.kernel, same.kinds, "x86-64") in keys
 
 
@@ -115,10 +111,8 @@ class TestBits:
     @pytest.mark.parametrize(("estimator", "noise_map"), ALL)
     def test_frames_whole_and_by_groups(self, estimator: str, noise_map: bool) -> None:
         pipeline = pipeline_of(estimator, TARGETS[native_target()].width, noise_map=noise_map)
-        # Each is compiled anew; how pixels are read is the same for all estimators.
-        kinds = ("uint16", "float32") if estimator == "brightest" else ("uint16",)
-        library = exported(pipeline, f"{estimator}_{noise_map}", pixels=kinds)
-        for kind in kinds:
+        library = exported(pipeline, f"{estimator}_{noise_map}")
+        for kind in ("uint16", "float32"):
             sensor, frames = sensor_of(library, kind), frames_of(pipeline, kind)
             groups = sensor.sensor.groups
             for frame in frames:
@@ -190,17 +184,17 @@ class TestTargets:
             export_library(pipeline_of("brightest"), CACHE / "arm", cpus=["x86-64"])
 
 
-def brightest(pixels: list[str], name: str) -> tuple[fs.SlopePipeline, ExportedLibrary]:
+def brightest(name: str) -> tuple[fs.SlopePipeline, ExportedLibrary]:
     """The sensor whose kernel compiles fastest, and its library."""
     pipeline = pipeline_of("brightest", TARGETS[native_target()].width)
-    return pipeline, exported(pipeline, name, pixels=pixels)
+    return pipeline, exported(pipeline, name)
 
 
 @pytest.mark.slow
 @needs_compiler
 class TestUse:
     def test_threads_measure_a_frame_together(self) -> None:
-        pipeline, library = brightest(["uint16"], "threads")
+        pipeline, library = brightest("threads")
         sensor, frames = sensor_of(library, "uint16", threads=3), frames_of(pipeline, "uint16")
         groups = sensor.sensor.groups
         for frame in frames:
@@ -219,7 +213,7 @@ class TestUse:
     @pytest.mark.parametrize("estimator", ["tv", "brightest", "thresholded", "window", "ml"])
     def test_parameters_are_those_of_python(self, estimator: str) -> None:
         pipeline = pipeline_of(estimator, TARGETS[native_target()].width)
-        sensor = sensor_of(exported(pipeline, estimator, pixels=["uint16"]), "uint16")
+        sensor = sensor_of(exported(pipeline, estimator), "uint16")
         rng, n = np.random.default_rng(6), len(pipeline.layout)
         values = {
             "noise_std": rng.uniform(0, 5, n),
@@ -253,7 +247,7 @@ class TestUse:
 
     def test_prior_of_map(self) -> None:
         pipeline = pipeline_of("map", TARGETS[native_target()].width)
-        sensor = sensor_of(exported(pipeline, "map_False", pixels=["uint16"]), "uint16")
+        sensor = sensor_of(exported(pipeline, "map_False"), "uint16")
         rng, n = np.random.default_rng(7), len(pipeline.layout)
         std = rng.uniform(0.1, 1.0, n).astype(np.float32)
         wider = pipeline.with_settings(pipeline.settings.replace(prior_std_px=std))
@@ -267,7 +261,7 @@ class TestUse:
         assert_same_bits(sensor.measure(frame), wider(frame))
 
     def test_dark_subapertures(self) -> None:
-        pipeline, library = brightest(["uint16"], "dark")
+        pipeline, library = brightest("dark")
         sensor, frame = sensor_of(library, "uint16"), frames_of(pipeline, "uint16")[0]
         dark = np.arange(len(pipeline.layout)) % 3 == 0
         for _ in range(2):
@@ -281,7 +275,7 @@ class TestUse:
     @pytest.mark.parametrize("estimator", ["brightest", "window"])
     def test_images_one_by_one(self, estimator: str) -> None:
         pipeline = pipeline_of(estimator, TARGETS[native_target()].width)
-        sensor = sensor_of(exported(pipeline, f"{estimator}_images", pixels=["images"]), "images")
+        sensor = sensor_of(exported(pipeline, f"{estimator}_images"), "images")
         images = pipeline.explain(frames_of(pipeline, "uint16")[0]).calibrated
         n, ny, nx = images.shape
         stacked = pipeline.for_images()
@@ -289,7 +283,7 @@ class TestUse:
         assert_same_bits(sensor.measure(images), expected)
         apart = np.full((n, ny * nx + 5), np.nan, np.float32)
         apart[:, : ny * nx] = images.reshape(n, -1)
-        other = sensor_of(exported(pipeline, f"{estimator}_images", pixels=["images"]), "images")
+        other = sensor_of(exported(pipeline, f"{estimator}_images"), "images")
         stride = ctypes.c_size_t(apart.shape[1])
         for first, count in ((0, 1), (1, 9), (10, n - 10)):
             part = apart[first : first + count].copy()
@@ -317,7 +311,7 @@ class TestMemory:
 
     @pytest.mark.parametrize("kind", ["uint16", "float32", "images"])
     def test_sanitizers_and_allocations(self, kind: str, tmp_path: Path) -> None:
-        pipeline, library = brightest(["uint16", "float32", "images"], "memory")
+        pipeline, library = brightest("memory")
         frames = frames_of(pipeline, kind if kind == "uint16" else "float32")
         if kind == "images":
             frames = pipeline.explain(frames[:10]).calibrated
@@ -330,14 +324,14 @@ class TestMemory:
 
     @pytest.mark.skipif(shutil.which("valgrind") is None, reason="no valgrind")
     def test_valgrind(self, tmp_path: Path) -> None:
-        pipeline, library = brightest(["uint16", "float32", "images"], "memory")
+        pipeline, library = brightest("memory")
         frames_of(pipeline, "uint16")[-9:].tofile(tmp_path / "frames")
         check = ("valgrind", "-q", "--error-exitcode=9", "--leak-check=full")
         run(*check, self.built(tmp_path, library), library.bundle, 0, tmp_path / "frames", 60)
 
     @pytest.mark.skipif(shutil.which("nm") is None, reason="no nm")
     def test_nothing_but_libc_is_needed(self) -> None:
-        _, library = brightest(["uint16"], "threads")
+        _, library = brightest("threads")
         symbols = run("nm", "-D", "-u", library.library).stdout.split()
         needed = {name.partition("@")[0] for name in symbols if "@" in name} - {"__cxa_finalize"}
         files, memory = (
@@ -352,7 +346,7 @@ class TestMemory:
 @needs_compiler
 class TestExamples:
     def test_c_cpp_and_python(self, tmp_path: Path) -> None:
-        pipeline, library = brightest(["uint16"], "example")
+        pipeline, library = brightest("example")
         folder, frames = library.bundle.parent, frames_of(pipeline, "uint16", 9)
         frames.tofile(tmp_path / "frames.raw")
         frames[:1].tofile(tmp_path / "frame.raw")

@@ -58,6 +58,7 @@ def test_without_a_layout_it_says_what_to_do(run: Commands) -> None:
     assert len(SlopePipeline.from_file("faintspot.toml").layout) == 16
 
 
+@pytest.mark.slow
 def test_calibration_of_an_existing_configuration_counts_and_stays(run: Commands) -> None:
     LAYOUT.save("faintspot.toml")
     Calibration(dark=100.0, gain_e_per_adu=2.0, read_noise_e=4.0).save("faintspot.toml")

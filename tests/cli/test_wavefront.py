@@ -5,7 +5,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from tests.cli.cli_cases import CONFIGURATION, Commands, simulated
-from tests.patience import mostly_slow
 from tests.slopes.sensor.sensor_cases import spot_frame
 
 from faintspot import Layout
@@ -194,7 +193,8 @@ def test_one_line_names_an_argument_that_cannot_be_used(run: Commands, slopes: P
         run.refused("wavefront", *arguments, naming=naming)
 
 
-@pytest.mark.parametrize("apart_px", mostly_slow(1, [0.0, 3.44, 11.44]))
+@pytest.mark.slow
+@pytest.mark.parametrize("apart_px", [0.0, 3.44, 11.44])
 def test_own_layouts_give_equal_modes(run: Commands, folder: Path, no_picture: None, apart_px: float) -> None:
     """A reference lights more lenslets, whose errors cancel, pitches away over another offset and frame."""
     row, column = np.mgrid[:7, :7].reshape(2, -1)

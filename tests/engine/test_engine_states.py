@@ -37,7 +37,7 @@ def without_waiting(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.hypothesis
 def test_engines_do_what_a_plain_model_does() -> None:
-    try_states(Engines, 6, 25)
+    try_states(Engines, 3, 25)
 
 
 @pytest.fixture

@@ -169,7 +169,7 @@ def _measured(
     scratch = guard(new_scratch(lanes, *window, own(lanes, *window)))
     if plan.prepared.needs_flux:
         flux = guard(np.empty((n_frames, n), np.float32))
-        plan.flux_kernel(frames)(source, 0, groups, scratch, flux)
+        plan.flux_kernel(source, 0, groups, scratch, flux)
         variants = plan.variants(flux.mean(axis=1, dtype=np.float64))
     else:
         variants = np.zeros(n_frames, np.int64)
@@ -178,7 +178,7 @@ def _measured(
     results = guard(SlopeArrays(*(np.empty((n_frames, n), kind) for kind in RESULT_TYPES)))
     rows = STAGE_ROWS * int(rng.integers(2))
     stages = guard(np.empty((rows, n_frames, n, pipeline.layout.pixels), np.float32))
-    plan.kernel(frames)(source, task, 0, groups, scratch, results, stages)
+    plan.kernel(source, task, 0, groups, scratch, results, stages)
     pipeline.flag_doubtful(results, guard(kernel_frames(frames)))
     return Slopes(*results)
 

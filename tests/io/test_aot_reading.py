@@ -62,6 +62,7 @@ def test_what_was_exported_is_read(tmp_path: Path) -> None:
     assert repr(sensor) == "AotSensor('SENSOR', 8 sub-apertures, layout, pixels, slopes, reference)"
 
 
+@pytest.mark.slow
 def test_windows_with_gaps_are_no_grid_of_the_standard(tmp_path: Path) -> None:
     apart = {"corners": [[12 * row, 12 * column] for row, column in ATTRIBUTES["layout"]["cells"]]}
     layout = ATTRIBUTES["layout"] | apart | {"frame_shape": (40, 40)}
@@ -104,6 +105,7 @@ def test_values_of_a_loop(tmp_path: Path) -> None:
     np.testing.assert_array_equal(sensor.commands[2], np.arange(64.0, 96.0))
 
 
+@pytest.mark.slow
 def test_exported_frames_are_measured(tmp_path: Path, run: Commands, monkeypatch: pytest.MonkeyPatch) -> None:
     """With the settings of a faintspot.toml, sub-apertures and reference slopes of the file."""
     images = images_of(10, 20)
@@ -176,6 +178,7 @@ def test_the_example_of_aotpy(tmp_path: Path) -> None:
         open_frames([tmp_path / "e.fits"], key="WFS2")
 
 
+@pytest.mark.slow
 def test_layout_of_the_configuration_comes_first(tmp_path: Path) -> None:
     example(tmp_path / "e.fits", with_subapertures)
     layout = fs.Layout.grid((2, 2), pixels=8, frame_shape=(20, 20))
@@ -201,6 +204,7 @@ def test_subapertures_of_others(tmp_path: Path) -> None:
     assert sensor.interaction[4].tolist() == [3.0, 4.0, 5.0]  # y of the first
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::faintspot.base.errors.DoubtWarning")
 def test_quad_cells_of_others_without_a_configuration(tmp_path: Path, run: Commands) -> None:
     def quad_cells(system: Any) -> None:
@@ -243,7 +247,7 @@ MASK = np.array([[7, 2, -1], [0, -1, 1], [-1, 3, -1]])
 @pytest.mark.parametrize(
     ("change", "naming"),
     mostly_slow(
-        3,
+        1,
         [
             (changed("sensor.detector", None), "one Shack-Hartmann sensor with pixels, it has: WFS1, WFS2"),
             (pyramid, "it has: none"),

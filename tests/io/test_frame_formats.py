@@ -54,6 +54,7 @@ def test_key_selects_the_frames(path: Path, kind: FrameFile) -> None:
                 np.testing.assert_array_equal(source.block(2, 9), cube()[2:9])
 
 
+@pytest.mark.slow
 def test_memory_is_bounded(path: Path, kind: FrameFile) -> None:
     """While blocks of 10 frames of 0.33 MB are read, of 6.6 MB."""
     if kind.whole:

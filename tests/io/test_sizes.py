@@ -65,6 +65,7 @@ def test_large_array_in_npz(tmp_path: Path, name: str, read: Callable[[Path], An
         read(tmp_path / "a.npz")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ending", ["npz", "fits.gz", "fits", "zarr"])
 def test_slopes_beyond_the_memory(tmp_path: Path, ending: str) -> None:
     path = tmp_path / f"slopes.{ending}"

@@ -93,6 +93,7 @@ class TestEveryFormat:
             write(path, whole)
         assert_stored(path, {**whole, "covariance_xy": np.zeros_like(covariance)})
 
+    @pytest.mark.slow
     def test_memory_does_not_grow_with_the_run(self, path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         """While 24 MB of slopes are written; measuring texts takes too long."""
         if path.suffix == ".csv":
@@ -309,7 +310,7 @@ class TestStore:
         assert not any(missing)
 
     @pytest.mark.usefixtures("all_marks")
-    @pytest.mark.parametrize("marks_before", [0, 4])
+    @pytest.mark.parametrize("marks_before", mostly_slow(1, [4, 0]))
     def test_disk_full_at_a_mark(
         self, path: Path, is_store: bool, marks_before: int, monkeypatch: pytest.MonkeyPatch
     ) -> None:

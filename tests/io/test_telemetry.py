@@ -133,6 +133,7 @@ def test_damage_is_said_and_never_read_as_other_telemetry(store: TelemetryStore)
     assert len(read_telemetry(store.path).frame) == 15
 
 
+@pytest.mark.slow
 def test_aot_is_read_back_by_aotpy(store: TelemetryStore, tmp_path: Path) -> None:
     aotpy = pytest.importorskip("aotpy")
     telemetry = read_telemetry(store.path)
@@ -167,6 +168,7 @@ def test_aot_is_read_back_by_aotpy(store: TelemetryStore, tmp_path: Path) -> Non
     assert np.allclose(pixels.time.timestamps, telemetry.unix_time_s[[0, 10]])
 
 
+@pytest.mark.slow
 def test_aot_without_images_and_what_cannot_be_written(tmp_path: Path) -> None:
     aotpy = pytest.importorskip("aotpy")
     store = TelemetryStore(tmp_path / "night.zarr", RECORD, IMAGE, ATTRIBUTES)

@@ -106,4 +106,4 @@ class SlopeFiles(RuleBasedStateMachine):
 def test_slope_files_are_what_was_appended(monkeypatch: pytest.MonkeyPatch, mark_s: float) -> None:
     monkeypatch.setattr(zarr_files, "_CHUNK_NUMBERS", 70)
     monkeypatch.setattr(slopes_writer, "_MARK_SECONDS", mark_s)
-    try_states(SlopeFiles, 3, 12)
+    try_states(SlopeFiles, 2, 12)

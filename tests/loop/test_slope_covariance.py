@@ -6,7 +6,6 @@ import pytest
 from tests.loop.control.control_cases import COVARIANCES, TURBULENCE
 from tests.loop.control.frozen_flow import frozen_slopes
 from tests.loop.telemetry.loop_cases import AIR, CELLS, CORNERS, NOISE_PX, RATE_HZ
-from tests.patience import mostly_slow
 
 from faintspot.base.errors import InputError
 from faintspot.loop.control.identification.preparation import prepared
@@ -76,7 +75,8 @@ def _by_offset(covariance: np.ndarray, cells: np.ndarray) -> np.ndarray:
     return np.array([np.bincount(which.reshape(-1), block) for block in blocks])
 
 
-@pytest.mark.parametrize("lag_s", mostly_slow(1, [0.0, 0.08]))
+@pytest.mark.slow
+@pytest.mark.parametrize("lag_s", [0.0, 0.08])
 def test_covariances_are_those_of_simulated_slopes(lag_s: float) -> None:
     """Of 960 wavefronts in 24 airs; the mean of pairs as far from each other.
 

@@ -51,6 +51,7 @@ def test_known_turbulence_is_found_within_its_errors(slopes: np.ndarray, noise_p
     assert known.r0_error_m < strength.r0_error_m
 
 
+@pytest.mark.slow
 def test_twice_the_slopes_have_a_smaller_r0(slopes: np.ndarray) -> None:
     """Twice the slopes: r0 is smaller by 2^(6/5)."""
     ratio = found(2 * slopes).r0_m / found(slopes).r0_m
@@ -93,7 +94,7 @@ def site(r0_m: float, outer_scale_m: float = 25.0) -> SlopeTurbulence:
 
 
 @pytest.mark.parametrize("r0_m", mostly_slow(1, [0.08, 0.25]))
-@pytest.mark.parametrize("outer_scale_m", [25.0, 100.0])
+@pytest.mark.parametrize("outer_scale_m", mostly_slow(1, [25.0, 100.0]))
 def test_r0_of_independent_frames_with_noise_and_vibration(r0_m: float, outer_scale_m: float) -> None:
     """Within 7 %: squares are taken for discs (1 %), an outer scale of 25 m adds 4 %, 2000 frames scatter."""
     turbulence, rng = site(r0_m, outer_scale_m), np.random.default_rng(1)

@@ -6,7 +6,7 @@ import click
 
 from faintspot.base.errors import InputError
 from faintspot.base.files import derived
-from faintspot.cli.commands import NAMES, REFERENCE, needs, needs_linux, option
+from faintspot.cli.commands import REFERENCE, needs, needs_linux, option
 
 
 @click.group("export")
@@ -61,14 +61,12 @@ def _telemetry(telemetry: Path, output: str | None, ao_mode: str) -> None:
     help="Processor to compile for: x86-64, x86-64-v3 (AVX2), x86-64-v4 (AVX-512) or aarch64.",
     show_default="all of x86-64, chosen when the library starts",
 )
-@option("--pixels", type=NAMES, metavar="LIST", default="uint16", help="Pixels: uint16, float32, images.")
 @REFERENCE
 @option("--no-build", is_flag=True, help="Write the sources, but do not build the library.")
 def _library(
     config: str,
     output: str,
     cpus: tuple[str, ...],
-    pixels: tuple[str, ...],
     reference: str | None,
     no_build: bool,
 ) -> None:
@@ -81,7 +79,7 @@ def _library(
     \b
     Examples:
       faintspot export library faintspot.toml -o library
-      faintspot export library --cpu x86-64-v3 --pixels uint16,images
+      faintspot export library --cpu x86-64-v3
     """
     from faintspot.adapters.library.folder import export_library
     from faintspot.cli.output import progress_bar
@@ -96,11 +94,10 @@ def _library(
             output,
             Path(config).stem,
             cpus=cpus,
-            pixels=pixels,
             compiler=None if no_build else "cc",
             progress=progress,
         )
-    click.echo(f"{result.bundle}: {result.bundle.stat().st_size / 1e3:.0f} kB for {', '.join(pixels)}")
+    click.echo(f"{result.bundle}: {result.bundle.stat().st_size / 1e3:.0f} kB")
     if result.library is None:
         click.echo(f"build the library: {result.build_line}")
     else:

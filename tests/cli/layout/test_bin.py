@@ -38,6 +38,7 @@ def measured(run: Commands, frames: NDArray[np.float64], *options: str | float) 
     return rise, float(slopes["flux"].mean()), float(slopes["valid"].mean())
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("only_found")
 def test_binned_colour_mosaic_is_measured(folder: Path, run: Commands) -> None:
     frames = frames_of(220, 9, 20.3, 1.5, 5000.0, 2.0)

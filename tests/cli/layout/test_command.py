@@ -45,7 +45,8 @@ def is_png(path: Path) -> bool:
     return content.startswith(b"\x89PNG\r\n") and len(content) > 5000
 
 
-@pytest.mark.parametrize("geometry", mostly_slow(1, ["square", "hexagonal"]))
+@pytest.mark.slow
+@pytest.mark.parametrize("geometry", ["square", "hexagonal"])
 def test_simulated_frames_give_their_lattice(folder: Path, run: Commands, geometry: str) -> None:
     """Lattice points within 0.2 px: 3 frames of 49 spots leave 0.01 px, the fit of a common grid less."""
     np.save("a.npy", frames(geometry))
@@ -277,6 +278,7 @@ def test_real_frames_give_their_lenslets(
     assert "Next: " in result.out
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("only_found")
 def test_lenslets_at_the_edge_are_left_out_or_windows_moved(folder: Path, run: Commands) -> None:
     """The spots of the first column lie 8 px from the edge, half a window of 20 px does not fit."""
@@ -291,6 +293,7 @@ def test_lenslets_at_the_edge_are_left_out_or_windows_moved(folder: Path, run: C
     assert "left out" not in result.out
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("only_found")
 def test_dark_level_and_hot_pixels_of_the_frame(run: Commands, folder: Path) -> None:
     array = frames()
@@ -396,7 +399,8 @@ def test_doubts_are_repeated_until_they_are_accepted(folder: Path, run: Commands
 
 
 @pytest.mark.usefixtures("only_found")
-@pytest.mark.parametrize("bad", mostly_slow(1, [0, 3, 7]))
+@pytest.mark.slow
+@pytest.mark.parametrize("bad", [0, 3, 7])
 def test_one_bad_frame_does_not_decide_the_settings(folder: Path, run: Commands, bad: int) -> None:
     """Overexposed, with stray light, or without flux; and frames that a grabber wrote twice."""
     good = np.concatenate([frames(n_frames=7), frames(n_frames=1)]).astype(np.float64)

@@ -131,7 +131,7 @@ def any_control(data: st.DataObject) -> None:
 
 @pytest.mark.slow
 def test_what_is_not_finite_never_reaches_the_mirror() -> None:
-    examples(100)(given(st.data())(any_control))()
+    examples(40)(given(st.data())(any_control))()
 
 
 def test_a_command_that_is_begun_while_rows_arrive_is_the_same(monkeypatch: pytest.MonkeyPatch) -> None:

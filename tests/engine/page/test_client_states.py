@@ -203,4 +203,4 @@ def test_clients_get_the_newest_messages_and_change_with_the_token_alone(
     for name in ("_WRONG_TOKEN_S", "_PAUSE_S"):
         monkeypatch.setattr(server_module, name, 0.0)
     monkeypatch.setattr(server_module, "_in_thread", at_once)
-    try_states(Clients, 60, 25)
+    try_states(Clients, 30, 25)

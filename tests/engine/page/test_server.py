@@ -258,6 +258,7 @@ def test_more_clients_than_there_is_room_for_are_refused() -> None:
     served(check)
 
 
+@pytest.mark.slow
 def test_slow_client_misses_messages_and_holds_up_nobody() -> None:
     """A picture is 1.3 MB: sockets hold a few, and all the others are dropped rather than kept."""
     large = Layout.grid((2, 2), pixels=16, frame_shape=(800, 800))

@@ -40,6 +40,7 @@ def test_one_progress_of_all_stages(whole: Path) -> None:
     assert (total == total[0]).all()
 
 
+@pytest.mark.slow
 def test_the_result_has_an_entry_for_each_method_and_flux(whole: Path) -> None:
     result = MagnitudeResult.load(whole / MAGNITUDE_FILE)
     assert result.labels == ("centre of gravity", "brightest pixels")

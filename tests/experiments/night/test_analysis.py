@@ -66,6 +66,7 @@ def test_errors_are_those_of_repeated_nights() -> None:
     assert sum(each.decided != 0 for each in found) <= 3  # 0.5 are expected
 
 
+@pytest.mark.slow
 def test_r0_that_one_method_measures_too_large_hardly_matters() -> None:
     shifts = [
         differences(night_with(seed, bias_of_r0=0.1))[0].measured.value

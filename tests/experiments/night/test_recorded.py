@@ -111,6 +111,7 @@ def test_the_difference_of_residual_phase_is_found(tmp_path: Path) -> None:
     assert "estimated from slopes" in text_of_recording(recorded)
 
 
+@pytest.mark.slow
 def test_measured_strehl_ratios(tmp_path: Path) -> None:
     known, effect = alternating(3000), 0.03
     path = stored(tmp_path, known)
@@ -141,6 +142,7 @@ def test_intervals_hold_in_drifting_seeing(tmp_path: Path) -> None:
     assert held >= 9
 
 
+@pytest.mark.slow
 def test_slopes_of_other_centroid_gains_tell_the_same_phase(tmp_path: Path) -> None:
     """Method 1 sees 0.8 of a displacement: unnoticed, its phase would come out 36 % smaller."""
     known = alternating(4000, 25, gains=(1.0, 0.8), noise_px=(0.03, 0.03))

@@ -59,7 +59,7 @@ def outcome(number: int, found: list[Any]) -> Outcome:
 @pytest.mark.parametrize(
     ("number", "good", "bad"),
     mostly_slow(
-        3,
+        1,
         [
             (1, 2.8, 0.8),
             (2, 2.5, 0.8),
@@ -78,6 +78,7 @@ def test_claim_is_decided_by_the_numbers(number: int, good: Any, bad: Any) -> No
     assert outcome(number, verdicts_of(bad)) is FAILS
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [1, 7])
 def test_a_smaller_gain_than_claimed_holds_in_part(number: int) -> None:
     assert outcome(number, verdicts_of(1.75)) is IN_PART
@@ -110,6 +111,7 @@ def test_some_cells_worse_holds_in_part_and_says_where() -> None:
     assert "10 e-" in verdict.best.cases[0].finding
 
 
+@pytest.mark.slow
 def test_no_difference_is_called_worse_in_five_per_cent_of_studies() -> None:
     """100 studies without any difference: at most 12 false alarms (4 x 10^-3 of the binomial of 5 %)."""
     rng = np.random.default_rng(5)
@@ -172,6 +174,7 @@ def test_against_tv_counts_cells() -> None:
     assert rows["brightest"].smallest == 0
 
 
+@pytest.mark.slow
 def test_gains_of_every_mode_and_none_where_there_is_no_crossing() -> None:
     sweeps = [
         Sweep("bright", flux_e=(20, 60, 200)),

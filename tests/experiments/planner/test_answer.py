@@ -23,7 +23,7 @@ def with_layout(answer: Answer, name: str) -> Answer:
     return dataclasses.replace(answer, question=question, equal=(name,))
 
 
-@pytest.mark.parametrize("name", mostly_slow(4, estimators()))
+@pytest.mark.parametrize("name", mostly_slow(1, estimators()))
 def test_the_configuration_gives_the_error_that_was_promised(name: str, tmp_path: Path) -> None:
     answer = with_layout(answered(), name)
     answer.save(tmp_path / "faintspot.toml")
@@ -69,6 +69,7 @@ def test_results_by_name() -> None:
         answer["tvs"]
 
 
+@pytest.mark.slow
 def test_the_recommendation_in_words() -> None:
     answer = with_layout(answered(budget="0.1"), "ml")
     lines = answer_text.recommendation(answer)

@@ -113,6 +113,7 @@ def test_the_same_seed_gives_the_same_answer() -> None:
     assert again.equal == answered().equal
 
 
+@pytest.mark.slow
 def test_progress_is_reported_to_the_end() -> None:
     seen: list[tuple[int, int]] = []
     question = Question(**{**CAMERA, "pixels": 8})

@@ -40,6 +40,7 @@ def test_structure_function_is_von_karmans() -> None:
     np.testing.assert_allclose(np.mean(measured, axis=0), expected, rtol=0.05)
 
 
+@pytest.mark.slow
 def test_small_structures_survive_the_interpolation() -> None:
     """Points 0.1 m apart: interpolation takes 3 to 8 % of the structure function there, no more."""
     atmosphere = make_atmosphere(quiet(), 7, 0)

@@ -70,6 +70,7 @@ def test_the_filter_s_certainty_is_the_estimator_s_prior() -> None:
     assert learnt_control(FAINT, _method(), 1, simulate_loop)[1] is None
 
 
+@pytest.mark.slow
 def test_telemetry_knows_what_was_expected() -> None:
     """Of an estimator whose prior is so narrow that it gives nothing else: open-loop slopes are -I latest."""
     method = replace(_method(), settings=fs.Settings("map", prior_std_px=1e-3))

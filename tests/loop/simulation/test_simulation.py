@@ -83,6 +83,7 @@ def test_the_static_error_lowers_strehl_ratios_alone() -> None:
     np.testing.assert_array_equal(worse.commands, record.commands)
 
 
+@pytest.mark.slow
 def test_each_realisation_differs(record: LoopRecord) -> None:
     other = simulate_loop(faint().replace("run", frames=5, settle_frames=1), [plain()], realisation=1)
     assert not np.array_equal(other.strehl[:5], record.strehl[:5])
@@ -170,6 +171,7 @@ def test_gain_correction_makes_a_loop_of_low_gain_as_fast() -> None:
     assert corrected.mean_strehl() > not_corrected.mean_strehl()
 
 
+@pytest.mark.slow
 def test_invalid_sub_apertures_do_no_harm() -> None:
     loop = faint().replace("run", frames=60)
     method = Method("nothing", fs.Settings(estimator="thresholded", threshold_e=1e6))

@@ -133,6 +133,7 @@ def test_tip_and_tilt_have_a_unit_rms() -> None:
     assert make_mirror(quiet().replace("mirror", tip_tilt=False), pupil).commands == 52
 
 
+@pytest.mark.slow
 def test_fitting_error_is_that_of_theory() -> None:
     """0.28 (pitch / r0)^(5/3) rad^2 is the usual number for a continuous mirror (Hudgin 1977, JOSA 67, 393).
 

@@ -366,6 +366,7 @@ def test_slopes_of_a_folder_in_three_dimensions(tmp_path: Path, order: str) -> N
     np.testing.assert_array_equal(loop.slopes, np.hstack([slopes[..., 0], slopes[..., 1]]))
 
 
+@pytest.mark.slow
 def test_sensor_without_cells(tmp_path: Path) -> None:
     """Slopes of any number and order; delay, noise and limits are reported, and no turbulence."""
     pytest.importorskip("matplotlib")

@@ -45,6 +45,7 @@ def test_loop_and_frames(report: LoopReport) -> None:
     assert value(report, "loop", "actuators that reached a limit").value == 0
 
 
+@pytest.mark.slow
 def test_noise_is_found_within_5_percent(report: Any) -> None:
     """To 5 %: turbulence within two frames is no parabola."""
     assert value(report, "noise", "noise of a slope").value == pytest.approx(NOISE_PX, rel=0.05)
@@ -76,6 +77,7 @@ def test_a_fast_vibration_is_no_noise() -> None:
     assert np.sqrt(np.square(noise).mean()) == pytest.approx(NOISE_PX, rel=0.03)
 
 
+@pytest.mark.slow
 def test_turbulence_is_found_within_its_errors(report: LoopReport) -> None:
     """Winds to 1 m/s; r0 within three errors, as ten seconds hold few independent wavefronts."""
     r0 = value(report, "turbulence", "r0 at 500 nm")
@@ -87,6 +89,7 @@ def test_turbulence_is_found_within_its_errors(report: LoopReport) -> None:
         assert speed * math.sin(direction) == pytest.approx(y, abs=1.0)
 
 
+@pytest.mark.slow
 def test_numbers_that_follow_from_others(report: LoopReport) -> None:
     noise = value(report, "noise", "noise of a slope")
     tilt = value(report, "noise", "tilt over a sub-aperture")
@@ -118,6 +121,7 @@ def test_numbers_that_follow_from_others(report: LoopReport) -> None:
     assert value(report, "frames", "duration").value == pytest.approx(FRAMES / RATE_HZ)
 
 
+@pytest.mark.slow
 def test_strehl_ratios_are_those_of_the_whole_residual(report: LoopReport) -> None:
     """Fitting 0.28 and aliasing 0.08 rad^2 at r0 = the sub-aperture's side, at 500 nm."""
     r0 = value(report, "turbulence", "r0 at 500 nm")
@@ -134,6 +138,7 @@ def test_strehl_ratios_are_those_of_the_whole_residual(report: LoopReport) -> No
         assert 2 * total.value * total.error == pytest.approx(variance_error, rel=1e-6)
 
 
+@pytest.mark.slow
 def test_vibrations_in_nm_are_those_of_the_wavefront(report: LoopReport) -> None:
     """A tip of slope s over a round pupil of diameter D has an rms of s D / 4; y slopes do not move."""
     found: Any = replace(report, parts=dict(report.parts))
@@ -148,6 +153,7 @@ def test_vibrations_in_nm_are_those_of_the_wavefront(report: LoopReport) -> None
     assert (tip.unit, focus.unit) == ("nm", "px")
 
 
+@pytest.mark.slow
 def test_filter_leaves_less_than_the_best_integrator(report: LoopReport) -> None:
     """The filter leaves less than the best integrator; an integrator of the loop's gain leaves as much."""
     found = {each.name: each for each in report.choices if each.name != "integrator"}
@@ -170,6 +176,7 @@ def numbers(values: Any) -> Iterator[dict[str, Any]]:
             yield from numbers(each)
 
 
+@pytest.mark.slow
 def test_every_number_has_an_interval(report: LoopReport) -> None:
     plain = parse_json(to_json(report.as_values(), exact=True))
     found = list(numbers(plain))

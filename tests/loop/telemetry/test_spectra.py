@@ -27,6 +27,7 @@ def found(change: np.ndarray, missing: float = 0.0) -> list[Measured]:
     return recorded_discrepancy(loop, seen, identified.of_winds(np.zeros((1, 2))))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("degrees", "gain", "missing"), mostly_slow(1, [(0.0, 1.0, 0.0), (5.0, 1.0, 0.1), (0.0, 1.2, 0.0)])
 )

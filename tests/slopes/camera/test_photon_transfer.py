@@ -47,6 +47,7 @@ def test_darks_and_frames_give_the_detector(detector: Detector, flux_e: float, m
     assert found.read_noise_e.value == pytest.approx(float(np.mean(detector.read_noise_e)), rel=0.09)
 
 
+@pytest.mark.slow
 def test_the_stated_error_of_the_gain_is_the_scatter() -> None:
     found = [measure_detector(*recorded(CAMERA, 2000.0, seed=seed, n_frames=20)) for seed in range(8)]
     gains = np.array([measured.gain_e_per_adu.value for measured in found])

@@ -3,7 +3,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from faintspot.slopes.kernels.gather import gather_raw
+from faintspot.slopes.kernels.gather import Frames, gather_raw
 from faintspot.slopes.kernels.host import aligned_zeros, lanes_for
 
 
@@ -20,7 +20,7 @@ def test_gathered_windows_equal_slices(window: tuple[int, int], width: int, dtyp
     rows[0], columns[0] = 31 - ny, 33 - nx
     for frame in range(2):
         image, block = (aligned_zeros(ny * nx * width, np.float32) for _ in range(2))
-        gather_raw(lanes, frames, frame, rows * 33 + columns, ny, nx, block, image)
+        gather_raw(lanes, Frames.of(frames), frame, rows * 33 + columns, ny, nx, block, image)
         for lane in range(width):
             expected = frames[frame, rows[lane] : rows[lane] + ny, columns[lane] : columns[lane] + nx]
             assert np.array_equal(image.reshape(ny, nx, width)[:, :, lane], expected)

@@ -121,6 +121,7 @@ def test_crossing_spots_are_both_flagged_while_they_cross() -> None:
     np.testing.assert_allclose(slopes.x[-1], truth[-1, :, 0], atol=0.1)
 
 
+@pytest.mark.slow
 def test_spots_beyond_the_frame_are_not_valid() -> None:
     record = recording(2007, Case(frames=40, order=1, pitches=1.5, missing=0.0))
     top = int(record.layout.corners[:, 0].min())

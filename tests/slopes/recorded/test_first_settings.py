@@ -37,6 +37,7 @@ def error(
     return float(np.abs(np.stack([slopes.x, slopes.y], axis=-1) - truth).mean())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("flux_e", "read_noise_e"), mostly_slow(2, [(50, 0.1), (200, 3.0), (2000, 3.0), (40, 3.0), (10, 3.0)])
 )
@@ -97,7 +98,8 @@ def sharp_spots(fwhm_px: float) -> tuple[FirstSettings, float]:
     return found, float(np.abs(errors - errors.mean(axis=0)).max())
 
 
-@pytest.mark.parametrize("fwhm_px", mostly_slow(2, [0.6, 0.7, 0.8, 0.9, 1.0, 1.3]))
+@pytest.mark.slow
+@pytest.mark.parametrize("fwhm_px", [0.6, 0.7, 0.8, 0.9, 1.0, 1.3])
 def test_sharp_spots_at_every_place_in_their_pixels(fwhm_px: float) -> None:
     """Less than 0.03 px of systematic error: the settings, and the PSF where a fit needs it."""
     found, error_px = sharp_spots(fwhm_px)
@@ -139,7 +141,8 @@ def array_of_wide_spots(fwhm_px: float, moved: NDArray[np.float64]) -> tuple[NDA
     return 5000 * y[:, :, None] * x[:, None, :], layout
 
 
-@pytest.mark.parametrize("fwhm_px", mostly_slow(1, [6.0, 8.4]))
+@pytest.mark.slow
+@pytest.mark.parametrize("fwhm_px", [6.0, 8.4])
 def test_spots_as_wide_as_their_neighbours_are_far(fwhm_px: float) -> None:
     """Systematic errors below 0.03 px up to 0.7 of the pitch, as the prediction says; the width is known."""
     rng = np.random.default_rng(1)

@@ -75,6 +75,7 @@ def test_dark_subapertures_are_left_out(recording: Path, tmp_path: Path) -> None
     np.testing.assert_allclose(found.lattice_of(wrong).centres, LAYOUT.centres, atol=0.15)
 
 
+@pytest.mark.slow
 def test_command_reads_as_many_frames_as_stated(recording: Path, run: Commands, tmp_path: Path) -> None:
     """The frames after them are saturated, and would hide the spots."""
     frames = np.full((30, *LAYOUT.frame_shape), 6e4, np.float32)

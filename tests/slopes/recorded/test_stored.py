@@ -127,6 +127,7 @@ def test_what_is_not_known_is_said(
         assert "Not drawn" not in Page(report_of_stored([path], frames=[tmp_path / "frames.npy"])).text
 
 
+@pytest.mark.slow
 def test_calibration_maps_come_from_the_original_configuration(tmp_path: Path) -> None:
     layout = sensor()
     slope = np.indices(layout.frame_shape).sum(axis=0) / 10.0
@@ -190,6 +191,7 @@ def test_a_psf_that_is_gone_is_said_in_one_line(tmp_path: Path) -> None:
     assert "Not drawn: the PSF of ml.zarr is gone" in page.text
 
 
+@pytest.mark.slow
 def test_an_analytic_psf_is_read_from_the_configuration(tmp_path: Path) -> None:
     path = measured(tmp_path, "ml")
     configured = tmp_path / "ml.toml"

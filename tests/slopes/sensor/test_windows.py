@@ -13,7 +13,7 @@ from faintspot.slopes.sensor import windows
 from faintspot.slopes.sensor.found_layout import find_layout
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", mostly_slow(1, range(4)))
 def test_windows_stay_on_their_spots_at_the_edge(seed: int) -> None:
     """The first column's windows do not fit: they are left out, the others are where they were."""
     at = lattice((7, 7), 20.0, (6.0, 12.0))
@@ -30,7 +30,7 @@ def test_windows_stay_on_their_spots_at_the_edge(seed: int) -> None:
 
 
 @pytest.mark.parametrize("pitch_px", mostly_slow(1, [16.0, 19.99, 12.005]))
-@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("seed", mostly_slow(1, range(2)))
 def test_a_pitch_of_whole_pixels_gives_windows_of_that_many(pitch_px: float, seed: int) -> None:
     # Single spots 0.28 and 0.34 pitches from their nodes were followed, with smaller windows.
     start = np.random.default_rng(seed).uniform(14, 16, 2)

@@ -48,6 +48,7 @@ def test_what_cannot_be_told_is_said() -> None:
         measure_on_spots(images_of(0.3, 1.0, 500.0, n=10), rng=rng)
 
 
+@pytest.mark.slow
 def test_noise_about_fitted_spots_is_the_camera_s() -> None:
     images = images_of(0.5, 1.0, 1000.0)
     fitted = fit_spots(images, PSF.analytic(radius_px=16))

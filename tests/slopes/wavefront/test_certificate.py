@@ -145,6 +145,7 @@ def test_a_drift_of_a_thousandth_of_a_pixel_is_seen() -> None:
     np.testing.assert_allclose(found.mean.mean(axis=0), drifting(change, 1).mean, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_drift_intervals_hold() -> None:
     """Of 30 recordings with 9 modes: 95 % with a standard error of 1.3 %; errors those of the scatter."""
     fits = [fit_drift(drifting(0.01, seed, 100), 10) for seed in range(30)]

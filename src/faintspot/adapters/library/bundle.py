@@ -28,12 +28,11 @@ FORMAT = 1
 PIXELS = ("uint16", "float32", "images")
 """Kinds of pixels: frames of uint16 or float32 [ADU], or calibrated images of float32 [e-]."""
 
-_CONSTANT, _INSTANCE, _THREAD, _FRAME = range(
-    4
-)  # whose an array is: of all, of one object, of a thread, given
+# Whose an array is: of all, of one object, of a thread, given.
+_CONSTANT, _INSTANCE, _THREAD, _FRAME = range(4)
 _VALUE, _POINTER = range(2)
 _NAMED = (
-    *("source.frames", "source.corners", "task.settings", "task.prior", "start", "stop"),
+    *("source.corners", "task.settings", "task.prior", "start", "stop"),
     *(f"slopes.{name}" for name in SlopeArrays._fields),
 )
 _MEASURE = ("source", "task", "start", "stop", "scratch", "slopes", "stages")
@@ -165,7 +164,7 @@ class _Cells:
 
 def _owner(path: str) -> int:
     """Return whose an array is."""
-    if path in ("source.frames", "check.frames"):
+    if path.startswith(("source.frames", "check.frames")):
         return _FRAME
     if path.startswith(("scratch", "check.scratch")):
         return _THREAD
@@ -181,7 +180,8 @@ def _block(variant: Variant, measure: str, check: str, pool: _Pool) -> bytes:
     count = len(cells.cells)
     for (path, value), kind in zip(variant.check.arguments.items(), variant.check.kinds, strict=True):
         cells.add(value, kind, f"check.{path}", _owner)
-    named = [cells.places[name] for name in (*_NAMED, "check.frames")]
+    used = "frames.counts" if variant.pixels == "uint16" else "frames.values"
+    named = [cells.places[name] for name in (f"source.{used}", *_NAMED, f"check.{used}")]
     rows = last_rows_of_groups(pipeline, pipeline.width)
     parameters = _parameters(pipeline)
     prepared, layout = pipeline.plan.prepared, pipeline.layout

@@ -41,7 +41,6 @@ def export_library(
     name: str = "sensor",
     *,
     cpus: Sequence[str] = (),
-    pixels: Sequence[str] = ("uint16",),
     compiler: str | None = "cc",
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> ExportedLibrary:
@@ -59,8 +58,6 @@ def export_library(
     cpus : sequence of str
         Kinds of processors, of `objects.TARGETS`; the library chooses the fastest that it runs on. Default:
         all like this one.
-    pixels : sequence of str
-        Kinds of pixels, of `bundle.PIXELS`.
     compiler : str, optional
         C compiler. None: do not build the library.
     progress : function
@@ -75,15 +72,10 @@ def export_library(
     chosen = [one_of("cpu", cpu, tuple(TARGETS)) for cpu in cpus] or targets_of(platform.machine())
     wanted = [cpu for cpu in TARGETS if cpu in chosen]
     machine = _only_machine(Path(folder) / "kernels", wanted)
-    kinds = [one_of("pixels", kind, PIXELS) for kind in dict.fromkeys(pixels)]
     folder = Path(folder)
     with output_errors(folder):
         (folder / "kernels").mkdir(parents=True, exist_ok=True)
-    variants = []
-    for cpu in wanted:
-        for kind in kinds:
-            variant = Variant.of(pipeline, kind, TARGETS[cpu].width)
-            variants.append((variant, cpu))
+    variants = [(Variant.of(pipeline, kind, TARGETS[cpu].width), cpu) for cpu in wanted for kind in PIXELS]
     keys = [(_key(variant.measure, cpu), _key(variant.check, cpu)) for variant, cpu in variants]
     calls = {
         key: (call, cpu)

@@ -23,6 +23,7 @@ from faintspot.engine.settings.running_settings import RunningSettings
 from faintspot.slopes.estimators.base import Estimator
 from faintspot.slopes.estimators.registry import estimator_named
 from faintspot.slopes.kernels.compiling import Direct, compiled_with
+from faintspot.slopes.kernels.gather import Frames
 from faintspot.slopes.kernels.validity.dark import BRIGHT, add_windows
 from faintspot.slopes.pipeline.light import MeanFlux, MeanLight
 from faintspot.slopes.pipeline.settings import Settings
@@ -115,9 +116,9 @@ class EnginePlan:
         if self.fallback is not None:
             self.fallback.warm_up()
         progress = Progress(np.zeros((2, 1), np.int64), 0, 1)
-        for dtype in (np.uint16, np.float32):
-            for pipeline in self.pipelines:
-                self._new_path(pipeline, np.zeros((1, *self.layout.frame_shape), dtype), progress)
+        nothing = np.zeros((1, *self.layout.frame_shape), np.uint16)
+        for pipeline in self.pipelines:
+            self._new_path(pipeline, nothing, progress)
 
 
 class SettingsPreparer:
@@ -263,9 +264,9 @@ class DarkFollower:
         self._light = MeanLight(stacked, maps, pipeline.plan.typical_fwhm_px)
         self._mean = np.zeros((self._n * ny, nx), np.float32)
         self._part, self._frames, self._most = 0, 0, _LONG
-        self._add = {dtype: Direct(add_windows) for dtype in map(np.dtype, (np.uint16, np.float32))}
-        for dtype in self._add:  # compile now
-            self._add[dtype](test, np.zeros((1, *layout.frame_shape), dtype), 0, 0, 1.0, self._mean)
+        self._add = Direct(add_windows)
+        nothing = Frames.of(np.zeros((1, *layout.frame_shape), np.uint16))
+        self._add(test, nothing, 0, 0, 1.0, self._mean)  # compile now
         self.dark = np.zeros(self._n, np.bool_)
         """Mask of the dark sub-apertures, (n,)."""
         self.changes = 0
@@ -277,7 +278,7 @@ class DarkFollower:
             return
         start, stop = (part * self._n // EVERY for part in (self._part, self._part + 1))
         weight = 1.0 / min(self._frames + 1, self._most)
-        self._add[frames.dtype](self._test, frames, start, stop, weight, self._mean)
+        self._add(self._test, Frames.of(frames), start, stop, weight, self._mean)
         self._part += 1
         if self._part == EVERY:
             self._part, self._frames = 0, min(self._frames + 1, self._most)

@@ -1,10 +1,13 @@
 """Between frames or stacks of images and groups of W sub-apertures with all lanes of a pixel side by side."""
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
 
 from faintspot.base.checks import LARGEST_FLOAT32
-from faintspot.slopes.kernels.compiling import compiled
+from faintspot.slopes.kernels.compiling import compiled, inlined
 from faintspot.slopes.kernels.simd import (
     absolute,
     copy_transposed,
@@ -14,8 +17,44 @@ from faintspot.slopes.kernels.simd import (
     select,
     splat,
     store,
+    widened,
     width_of,
 )
+
+
+class Frames(NamedTuple):
+    """Frames (n, h, w) of either type that kernels read: the other array has none.
+
+    Kernels choose between the two as they run: for each type one more compilation would take seconds.
+    """
+
+    counts: Any
+    """uint16."""
+    values: Any
+    """float32."""
+    are_counts: Any
+
+    @classmethod
+    def of(cls, array: NDArray[np.generic]) -> "Frames":
+        """Return contiguous frames, uint16 or float32, of which nothing is copied."""
+        none = (0, *array.shape[1:])
+        if array.dtype == np.uint16:
+            return cls(array, np.empty(none, np.float32), True)
+        return cls(np.empty(none, np.uint16), array, False)
+
+    @property
+    def array(self) -> NDArray[Any]:
+        """The array that has the frames."""
+        frames: NDArray[Any] = self.counts if self.are_counts else self.values
+        return frames
+
+
+@inlined
+def pixels_of(lanes: Any, frames: Any, offset: Any) -> Any:
+    """Return W consecutive pixels of frames, as numbers of the lanes' type."""
+    if frames.are_counts:
+        return widened(lanes, frames.counts, offset)
+    return widened(lanes, frames.values, offset)
 
 
 @compiled
@@ -26,7 +65,7 @@ def gather_raw(
 
     Parameters
     ----------
-    frames : (n_frames, h, w) array
+    frames : Frames
     frame : int
     corners : (W,) int64
         Flat offset of each sub-aperture's first pixel in its frame.
@@ -35,6 +74,17 @@ def gather_raw(
     image : (ny * nx * W,) array
         Written.
     """
+    if frames.are_counts:
+        _gather(lanes, frames.counts, frame, corners, ny, nx, block, image)
+    else:
+        _gather(lanes, frames.values, frame, corners, ny, nx, block, image)
+
+
+@compiled
+def _gather(
+    lanes: Any, frames: Any, frame: Any, corners: Any, ny: Any, nx: Any, block: Any, image: Any
+) -> None:
+    """See `gather_raw`; of frames of one type."""
     width = width_of(lanes)
     height, line = frames.shape[1:]
     whole, last = nx - nx % width, 0

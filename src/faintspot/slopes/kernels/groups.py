@@ -49,7 +49,7 @@ class Source(NamedTuple):
     lanes: Any
     """Lanes: W sub-apertures at once."""
     frames: Any
-    """(n_frames, h, w) uint16 or float32."""
+    """Frames."""
     corners: Any
     """(n_subapertures, 2) int64: row and column of every window's first pixel."""
     ny: Any
@@ -148,7 +148,7 @@ def gather_group(source: Any, f: Any, first: Any, scratch: Any) -> None:
     """Gather and calibrate the W sub-apertures of a group; write counts of bad and saturated pixels."""
     lanes, ny, nx = source.lanes, source.ny, source.nx
     width = width_of(lanes)
-    n, line = source.corners.shape[0], source.frames.shape[2]
+    n, line = source.corners.shape[0], source.frames.counts.shape[2]
     for lane in range(width):
         s = min(first + lane, n - 1)
         scratch.places[lane] = source.corners[s, 0] * line + source.corners[s, 1]

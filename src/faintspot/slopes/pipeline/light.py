@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from faintspot.base.checks import not_none, number_between, numbers_between, real_array
 from faintspot.base.errors import InputError
+from faintspot.slopes.kernels.gather import Frames
 from faintspot.slopes.kernels.host import WIDTHS, lanes_for
 from faintspot.slopes.kernels.validity.dark import MOST_LANES, LightTest, scratch_size, significances
 from faintspot.slopes.sensor.layout import Layout
@@ -81,7 +82,7 @@ class MeanLight:
         It is below 1 in dark windows, and infinite in windows too small for a test. NaN marks pixels without
         any value.
         """
-        frames = np.ascontiguousarray(mean, np.float32)[None]
+        frames = Frames.of(np.ascontiguousarray(mean, np.float32)[None])
         scratch = np.empty(scratch_size(*self._window), np.float32)
         largest, found = np.zeros(self._n, np.float32), np.empty(self._n, np.float32)
         for test in self._tests:

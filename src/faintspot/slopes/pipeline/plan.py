@@ -134,7 +134,7 @@ class Plan:
         self._fixed = self._fixed_table(per_subaperture)
         self._levels: list[NDArray[np.float32]] = []
         self._variants: dict[int, int] = {}
-        self._kernels: dict[tuple[object, str], Direct] = {}
+        self._kernels: dict[object, Direct] = {}
         self._lock = threading.RLock()
         self._made: tuple[NDArray[np.float32], object, object] | None = None
         if not self.prepared.needs_flux:
@@ -150,19 +150,20 @@ class Plan:
         """Function that allocates the scratch memory of the estimator's kernel."""
         return self._arguments()[2]
 
-    def kernel(self, frames: NDArray[np.generic]) -> Direct:
-        """Return the compiled function that measures groups of frames of this dtype."""
-        return self._direct(self.prepared.kernel, frames)
+    @property
+    def kernel(self) -> Direct:
+        """Compiled function that measures groups."""
+        return self._direct(self.prepared.kernel)
 
-    def flux_kernel(self, frames: NDArray[np.generic]) -> Direct:
-        """Return the compiled function that sums their flux."""
-        return self._direct(self.prepared.flux_kernel, frames)
+    @property
+    def flux_kernel(self) -> Direct:
+        """Compiled function that sums their flux."""
+        return self._direct(self.prepared.flux_kernel)
 
-    def _direct(self, kernel: object, frames: NDArray[np.generic]) -> Direct:
-        key = kernel, frames.dtype.char
-        if key not in self._kernels:
-            self._kernels[key] = Direct(kernel)
-        return self._kernels[key]
+    def _direct(self, kernel: object) -> Direct:
+        if kernel not in self._kernels:
+            self._kernels[kernel] = Direct(kernel)
+        return self._kernels[kernel]
 
     def task(self, variants: NDArray[np.int64], prior: NDArray[np.float32] | None = None) -> Task:
         """Return the kernel's task for frames.
@@ -268,7 +269,7 @@ class FrameArguments(NamedTuple):
     @property
     def groups(self) -> int:
         """Number of groups in all frames."""
-        n_frames, n = len(self.source.frames), len(self.source.corners)
+        n_frames, n = len(self.task.variants), len(self.source.corners)
         return n_frames * int(-(-n // self.source.lanes.width))
 
     def measuring(self, start: int, stop: int, scratch: Scratch) -> tuple[Any, ...]:
@@ -305,7 +306,7 @@ class SmallFrames:
         check: Callable[[], None],
         layout: Layout,
     ) -> None:
-        self._frame = arguments.source.frames[0]
+        self._frame = arguments.source.frames.array[0]
         self._slopes = [result[0] for result in arguments.slopes]
         self._kernel, self._check, self._layout = kernel, check, layout
         self._arguments = arguments.measuring(0, arguments.groups, scratch)

@@ -21,6 +21,7 @@ from faintspot.base.flags import scaled_positions
 from faintspot.slopes.camera.calibration import Calibration, binned, binned_calibration, spread
 from faintspot.slopes.estimators.base import Estimator
 from faintspot.slopes.kernels.compiling import Direct
+from faintspot.slopes.kernels.gather import Frames
 from faintspot.slopes.kernels.groups import (
     CALIBRATED,
     STAGE_ROWS,
@@ -326,7 +327,7 @@ class SlopePipeline:
         frames = np.empty((1, *self.layout.frame_shape), np.float32 if dtype.kind == "f" else np.uint16)
         arguments = self.arguments(frames, dtype)
         scratch = thread_scratch(lanes, window, plan.own_scratch)
-        return SmallFrames(plan.kernel(frames), arguments, scratch, self.check(arguments), self.layout)
+        return SmallFrames(plan.kernel, arguments, scratch, self.check(arguments), self.layout)
 
     def explain(self, frame: ArrayLike, prior: ArrayLike | Slopes | None = None) -> Stages:
         """Return the sub-aperture images after every step, for figures and for debugging.
@@ -371,7 +372,7 @@ class SlopePipeline:
         predicted = None if prior is None else prior_slopes(prior, n_frames, self.layout) / np.float32(factor)
         task = self.plan.task(self._variants(self.source(frames, dtype)), predicted)
         arguments = self.arguments(frames, dtype, task, stages=stages)
-        kernel, results = self.plan.kernel(frames), arguments.slopes
+        kernel, results = self.plan.kernel, arguments.slopes
 
         def job(start: int, stop: int, scratch: Scratch) -> None:
             kernel(*arguments.measuring(start, stop, scratch))
@@ -445,7 +446,7 @@ class SlopePipeline:
 
     def check(self, arguments: FrameArguments) -> Callable[[], None]:
         """Return `flag_doubtful` for these arguments, to be called for all frames written to their memory."""
-        kernel = _checks(arguments.source.frames.dtype, self.light_test.lanes, self._lanes)
+        kernel = _checks(self.light_test.lanes, self._lanes)
         return partial(kernel, *arguments.checking(self.new_check_scratch()))
 
     def source(self, frames: NDArray[np.generic], dtype: DTypeLike) -> Source:
@@ -459,16 +460,14 @@ class SlopePipeline:
         """
         saturation = self.calibration.saturation(np.dtype(dtype)) * self.layout.bin**2
         corners, window = self.binned_layout.corners, self.binned_layout.window
-        return Source(self._lanes, frames, corners, *window, self._calibration, saturation)
+        return Source(self._lanes, Frames.of(frames), corners, *window, self._calibration, saturation)
 
     def _variants(self, source: Source) -> NDArray[np.int64]:
         """Return the index of the settings table of each frame, by its flux if settings depend on it."""
-        n_frames, n = len(source.frames), len(self.layout)
+        n_frames, n = len(source.frames.array), len(self.layout)
         if not self.needs_flux:
             return np.zeros(n_frames, np.int64)
-        flux = np.empty((n_frames, n), np.float32)
-
-        flux_kernel = self.plan.flux_kernel(source.frames)
+        flux, flux_kernel = np.empty((n_frames, n), np.float32), self.plan.flux_kernel
 
         def job(start: int, stop: int, scratch: Scratch) -> None:
             flux_kernel(source, start, stop, scratch, flux)
@@ -479,8 +478,8 @@ class SlopePipeline:
 
 
 @cache
-def _checks(dtype: np.dtype[np.generic], pixels: Lanes, subapertures: Lanes) -> Direct:
-    """Return `check_slopes` for frames of a type, and so many pixels and sub-apertures at once."""
+def _checks(pixels: Lanes, subapertures: Lanes) -> Direct:
+    """Return `check_slopes` for so many pixels and sub-apertures at once."""
     return Direct(check_slopes)
 
 

@@ -67,6 +67,7 @@ def test_errors_of_gains_are_those_of_least_squares() -> None:
     assert 0.9 * least < seen.gain_error < 1.5 * least
 
 
+@pytest.mark.slow
 def test_gain_in_bright_turbulence_without_fine_structure() -> None:
     """Within two errors. Turbulence of von Karman falls less steeply, and alone gave 0.51 +- 0.25."""
     rng = np.random.default_rng(3)

@@ -57,6 +57,7 @@ def tip_tilt() -> PredictiveControl:
     return learn(recorded(*integrated(wandering(rng, FRAMES), rng)))
 
 
+@pytest.mark.slow
 def test_tip_and_tilt_are_better_than_with_the_integrator(tip_tilt: PredictiveControl) -> None:
     """By 20 % of the variance, in new frames, with the guard."""
     open_loop = wandering(np.random.default_rng(2), 2500)
@@ -112,7 +113,7 @@ def test_controller_from_a_file_does_the_same(tip_tilt: PredictiveControl, tmp_p
 
 @pytest.mark.hypothesis
 def test_a_controller_is_its_model_whatever_comes(tip_tilt: PredictiveControl) -> None:
-    try_states(type("TipTilt", (Controls,), {"learnt": tip_tilt}), 25, 10)
+    try_states(type("TipTilt", (Controls,), {"learnt": tip_tilt}), 12, 10)
 
 
 def test_slopes_that_are_not_measured(tip_tilt: PredictiveControl) -> None:

@@ -63,6 +63,7 @@ def test_it_goes_on_from_what_the_mirror_holds(learnt: Kalman) -> None:
     assert np.linalg.norm(line.latest - held) < 0.35 * np.linalg.norm(held)
 
 
+@pytest.mark.slow
 def test_another_controller_of_the_same_loop(learnt: Kalman) -> None:
     """The integrator needs no model; only the filter tells estimators what it expects, if nothing is said."""
     control = Control(INTERACTION, None, ControlOptions(gain=0.3), learnt)

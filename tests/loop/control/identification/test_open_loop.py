@@ -77,6 +77,7 @@ def test_infinite_slopes_count_as_not_measured() -> None:
     assert np.isfinite(np.delete(read.slopes, 3, axis=0)).all()
 
 
+@pytest.mark.slow
 def test_a_gain_at_the_limit_is_not_known() -> None:
     """Commands act the other way round than the interaction matrix says."""
     loop = recorded()

@@ -16,6 +16,7 @@ from tests.loop.control.control_cases import (
     telemetry,
 )
 from tests.loop.control.naive_guarded import Guarded
+from tests.patience import mostly_slow
 
 from faintspot.loop.control import integrator
 from faintspot.loop.control.base import CommandDelayLine
@@ -147,7 +148,7 @@ def both() -> tuple[list[GuardedController], list[CommandDelayLine]]:
     return [slow, fast], lines
 
 
-@pytest.mark.parametrize("fails", [False, True], ids=["computed", "measured"])
+@pytest.mark.parametrize("fails", mostly_slow(1, [True, False]))
 def test_it_does_the_same_before_and_after_the_integrator_takes_over(
     both: tuple[list[GuardedController], list[CommandDelayLine]], fails: bool
 ) -> None:

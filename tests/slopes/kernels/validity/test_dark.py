@@ -105,6 +105,7 @@ def test_neither_dark_level_nor_gain_is_needed() -> None:
 
 
 class TestMeans:
+    @pytest.mark.slow
     def test_windows_of_noise_pass_once_in_a_thousand_times(self) -> None:
         """At most: the limit allows for every pixel of the window, and two boxes."""
         passed = 0

@@ -198,7 +198,7 @@ static const char *choose(faintspot *s, const char *bundle, size_t size, int pix
         s->sensor = (faintspot_sensor){v->n, v->ny, v->nx, v->h, v->w, v->width, v->groups, pixels, needs == 4 ? "x86-64-v4" : needs == 3 ? "x86-64-v3" : needs ? "x86-64" : "aarch64", kept->version, kept->fingerprint};
         return fill(s, &h, e.offset, threads);
     }
-    return there ? "this library has no kernels for the bundle on this processor: export it into the library's folder" : "the bundle has no tables for these pixels: see --pixels of faintspot export library";
+    return there ? "this library has no kernels for the bundle on this processor: export it into the library's folder" : "the bundle has no tables for these pixels";
 }
 
 faintspot *faintspot_create(const void *bundle, size_t size, int pixels, int threads, const char **error) {

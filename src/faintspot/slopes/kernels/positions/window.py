@@ -13,6 +13,7 @@ import numpy as np
 from faintspot.base.checks import LARGEST_FLOAT32
 from faintspot.slopes.kernels import groups
 from faintspot.slopes.kernels.compiling import compiled
+from faintspot.slopes.kernels.gather import pixels_of
 from faintspot.slopes.kernels.groups import (
     COMMON_ROWS,
     NO_FLUX,
@@ -36,7 +37,6 @@ from faintspot.slopes.kernels.simd import (
     splat,
     store,
     sum_of,
-    widened,
     width_of,
 )
 
@@ -161,7 +161,7 @@ def _measure(source: Any, tables: Any, f: Any, s: Any, settings: Any, slopes: An
         return False
     frames, corners, pixels = source.frames, source.corners, tables.pixels
     width = width_of(pixels)
-    height, line = frames.shape[1], frames.shape[2]
+    height, line = frames.counts.shape[1], frames.counts.shape[2]
     rows, vectors = tables.weights.shape[1], tables.weights.shape[2]
     corner = (corners[s, 0] + tables.top) * line + corners[s, 1] + tables.left
     zero = splat(pixels, 0.0)
@@ -170,7 +170,7 @@ def _measure(source: Any, tables: Any, f: Any, s: Any, settings: Any, slopes: An
     place = s * rows * vectors * 3 * width
     for y in range(rows):
         for vector in range(vectors):
-            raw = widened(pixels, frames, f * height * line + corner + y * line + vector * width)
+            raw = pixels_of(pixels, frames, f * height * line + corner + y * line + vector * width)
             brightest = maximum(raw, brightest)
             g = raw - level
             largest = maximum(absolute(g), largest)

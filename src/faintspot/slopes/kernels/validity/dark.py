@@ -12,6 +12,7 @@ import numpy as np
 from faintspot.base.checks import LARGEST_FLOAT32
 from faintspot.base.flags import UNMEASURED, SubapertureFlag
 from faintspot.slopes.kernels.compiling import compiled, inlined
+from faintspot.slopes.kernels.gather import pixels_of
 from faintspot.slopes.kernels.simd import (
     absolute,
     get,
@@ -21,7 +22,6 @@ from faintspot.slopes.kernels.simd import (
     splat,
     store,
     sum_of,
-    widened,
     width_of,
 )
 
@@ -78,7 +78,7 @@ def flag_dark(test: Any, frames: Any, slopes: Any, scratch: Any) -> None:
     Parameters
     ----------
     test : LightTest
-    frames : (n_frames, h, w) array, uint16 or float32
+    frames : Frames
     slopes : SlopeArrays
     scratch : float32 array
         At least `scratch_size` numbers.
@@ -189,7 +189,7 @@ def add_windows(test: Any, frames: Any, start: Any, stop: Any, weight: Any, mean
     weight : float
         Of the frame in the mean; pixels that are not finite do not count.
     """
-    lanes, (ny, nx), line = test.lanes, test.window, frames.shape[2]
+    lanes, (ny, nx), line = test.lanes, test.window, frames.counts.shape[2]
     width = width_of(lanes)
     limit, zero = splat(lanes, LARGEST_FLOAT32), splat(lanes, 0.0)
     for s in range(start, stop):
@@ -200,7 +200,7 @@ def add_windows(test: Any, frames: Any, start: Any, stop: Any, weight: Any, mean
                     x, part = nx - width, part * load(lanes, test.last, 0)
                 at = (s * ny + y) * nx + x
                 before = load(lanes, mean, at)
-                raw = widened(lanes, frames, (test.corners[s, 0] + y) * line + test.corners[s, 1] + x)
+                raw = pixels_of(lanes, frames, (test.corners[s, 0] + y) * line + test.corners[s, 1] + x)
                 store(mean, at, before + select(absolute(raw) <= limit, (raw - before) * part, zero))
 
 
@@ -256,9 +256,9 @@ def _border_difference(test: Any, frames: Any, f: Any, s: Any) -> Any:
 @inlined
 def _calibrated(test: Any, frames: Any, f: Any, y: Any, x: Any) -> Any:
     """Return the calibrated pixels of a row of a frame from x on; NaN or infinite if bad."""
-    height, line = frames.shape[1:]
+    height, line = frames.counts.shape[1:]
     at = y * line + x
-    raw = widened(test.lanes, frames, f * height * line + at)
+    raw = pixels_of(test.lanes, frames, f * height * line + at)
     dark, scale = load(test.lanes, test.maps, at), load(test.lanes, test.maps, height * line + at)
     return (raw - dark) * scale
 
