@@ -10,7 +10,6 @@ def test_library_refuses_in_one_line(run: Commands, tmp_path: Path) -> None:
     toml.write_text(CONFIGURATION)
     folder = tmp_path / "library"
     run.refused("export", "library", toml, "-o", folder, "--cpu", "z80", naming=("z80", "x86-64-v3"))
-    run.refused("export", "library", toml, "-o", folder, "--pixels", "int8", naming=("int8", "uint16"))
     toml.write_text(f"[layout]\nbin = 2\n{CONFIGURATION}")
     run.refused("export", "library", toml, "-o", folder, naming=("bin", "1"))
     run.refused("export", "library", tmp_path / "none.toml", naming=("none.toml",))

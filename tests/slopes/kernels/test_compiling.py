@@ -177,6 +177,22 @@ def test_each_kind_of_argument_has_a_file_of_its_own(tmp_path: Path, monkeypatch
     assert hits(fourth) == 2
 
 
+def test_one_process_compiles_while_others_wait(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    filelock = pytest.importorskip("filelock")
+    first = dispatcher(tmp_path, monkeypatch)
+    assert first(1) == 2
+    (path,) = tmp_path.rglob("*.lock")
+    with filelock.FileLock(path, timeout=0):  # it is free again
+        assert dispatcher(tmp_path, monkeypatch)(1) == 2  # what is there needs no lock
+        monkeypatch.setattr(compiling, "_MOST_WAITING_S", 0.01)
+        assert first(1.5) == 2.5  # after waiting
+    assert first._cache.load_overload((numba.types.complex128,), first.targetctx) is None
+    with pytest.raises(filelock.Timeout):  # it is about to be compiled
+        filelock.FileLock(path, timeout=0).acquire()
+    assert first(1j) == 1 + 1j
+    filelock.FileLock(path, timeout=0).acquire()
+
+
 def test_no_folder_at_all(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(CacheImpl, "_locator_classes", [])
     with pytest.warns(CacheWarning, match="NUMBA_CACHE_DIR") as said:

@@ -39,23 +39,38 @@ def kernel_cache(function: Callable[..., Any], stamp: Any) -> Any:
 
 
 class _KernelCache(FunctionCache):
-    """Numba's cache, tolerant of a disk that is full, read-only or damaged."""
+    """Numba's cache, tolerant of a disk that is full, read-only or damaged.
+
+    Of several processes that need the same code, one compiles it while the others wait.
+    """
+
+    _lock: Any = None
 
     def __init__(self, function: Callable[..., Any], stamp: Any) -> None:
         super().__init__(function)
         self._cache_file = _KernelFiles(self._cache_path, self._impl.filename_base, stamp)
 
     def load_overload(self, *arguments: Any) -> Any:
+        """Return the cached code, or None, and keep others from compiling it, until it is saved."""
+        self._unlock()  # after a compilation that failed
+        kept = self._kept(*arguments)
+        if kept is None:
+            self._lock = _locked(Path(self._cache_path, f"{self._impl.filename_base}.lock"))
+            kept = self._kept(*arguments)
+            if kept is None:
+                _tell_once()
+            else:
+                self._unlock()
+        return kept
+
+    def _kept(self, *arguments: Any) -> Any:
         """Return the cached code, or discard it and return None if it cannot be read."""
-        kept = None
         try:
-            kept = super().load_overload(*arguments)
+            return super().load_overload(*arguments)
         except Exception:  # a damaged pickle raises anything
             with suppress(OSError):
                 self._cache_file.flush()
-        if kept is None:
-            _tell_once()
-        return kept
+        return None
 
     def save_overload(self, *arguments: Any) -> None:
         """Store machine code if possible."""
@@ -63,6 +78,23 @@ class _KernelCache(FunctionCache):
             super().save_overload(*arguments)
         except OSError as error:
             _warn_once(f"{self._cache_path}: {error.strerror or error}")
+        self._unlock()
+
+    def _unlock(self) -> None:
+        if self._lock is not None:
+            self._lock.release()
+        self._lock = None
+
+
+def _locked(path: Path) -> Any:
+    """Return a lock on a file; None where there are none, or another process takes too long."""
+    with suppress(ImportError, NotImplementedError, OSError):  # a time that is up is an OSError, too
+        from filelock import FileLock  # of an extra
+
+        lock = FileLock(path, timeout=_MOST_WAITING_S)
+        lock.acquire()
+        return lock
+    return None
 
 
 class _KernelFiles(IndexDataCacheFile):
@@ -97,6 +129,7 @@ def _warn_once(reason: str) -> None:
 
 
 _KERNELS = Path(__file__).parent
+_MOST_WAITING_S = 60.0  # for another process that compiles
 
 
 @cache
