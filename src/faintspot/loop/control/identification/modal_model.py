@@ -52,11 +52,11 @@ class LoopOfControl:
     """(2 n,): such slopes in a unit of the user's."""
     delay: Floats
     """(6,): delay in frames, centroid gain, and that of x relative to y, each with its standard error."""
-    winds: Floats
+    winds: Floats = field(default_factory=lambda: np.zeros((0, 6)))
     """(layers, 6): speed, direction and share, each with its standard error."""
-    largest_command: Floats
+    largest_command: Floats | float = math.inf
     """(commands,): stroke limit about the flat command."""
-    integrator_gain: float
+    integrator_gain: float = math.nan
     recorded_gain: float = math.nan
     """Gain of the recorded integrator on the controller's slopes, if the fallback has another one."""
     law: str = ""
@@ -97,17 +97,8 @@ class LoopOfControl:
             reference_slopes=ready.reference_slopes,
             flat_command=ready.flat_command,
         )
-        return cls(
-            recorded,
-            matrix,
-            np.where(np.isfinite(loop.slopes).any(axis=0), error, np.inf),
-            1 / (loop.unit * gains),
-            delay.row(),
-            np.zeros((0, 6)),
-            np.full(matrix.shape[1], math.inf),
-            math.nan,
-            **options,
-        )
+        errors = np.where(np.isfinite(loop.slopes).any(axis=0), error, np.inf)
+        return cls(recorded, matrix, errors, 1 / (loop.unit * gains), delay.row(), **options)
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Return the loop as arrays by their names in files, see `read`."""

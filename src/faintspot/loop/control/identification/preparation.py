@@ -82,9 +82,7 @@ def _in_one_convention(recording: Recording) -> Prepared:
     moves = scaled.commands is not None and np.ptp(scaled.commands, axis=0).any()
     if (moves or not scaled.is_closed) and (doubt := order_doubt(scaled)):
         scaled = replace(scaled, remarks=(*scaled.remarks, doubt))
-    if not recording.is_closed:
-        return Prepared(scaled, 1.0, 0, math.inf, *offsets)
-    if recording.commands is None or recording.interaction_matrix is None:
+    if not recording.is_closed or recording.commands is None or recording.interaction_matrix is None:
         return Prepared(scaled, 1.0, 0, math.inf, *offsets)
     loop, sign, sent, loop_gain = _with_convention(scaled)
     silent = _silent(loop)

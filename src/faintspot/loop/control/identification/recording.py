@@ -148,8 +148,8 @@ class LoopSystem:
 class Recording(LoopSystem, LoopFrames):
     """Slopes and commands of consecutive frames of a loop, and its system; None if unknown.
 
-    With `cells`, the slopes are
-    those of n sub-apertures; without, any measurements of the wavefront, such as those of a pyramid.
+    With `cells`, the slopes are those of n sub-apertures; without, any measurements of the wavefront, such as
+    those of a pyramid.
 
     Raises
     ------
