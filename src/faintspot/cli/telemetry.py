@@ -50,6 +50,13 @@ _LACKS = "What FILE lacks"
 )
 @option("--one-loop", is_flag=True, help="Report the loop as a whole, although methods alternated.")
 @option("--every", type=float, metavar="SECONDS", help="Turbulence against time as well, in such pieces.")
+@option(
+    "--fade-level",
+    type=float,
+    metavar="SHARE",
+    default=0.5,
+    help="Flux of the aperture below which its light fades, of the mean.",
+)
 @option("--slopes", metavar="NAME", section=_LACKS, help="Array in FILE, or file, with the slopes.")
 @option("--commands", metavar="NAME", section=_LACKS, help="Array in FILE, or file, with the commands.")
 @option(
@@ -86,6 +93,7 @@ def command(
     settle: int | None,
     one_loop: bool,
     every: float | None,
+    fade_level: float,
     controller: str | None,
     output: str | None,
     **stated: float | str | None,
@@ -126,17 +134,17 @@ def command(
     loop = read_recorded_loop(recording, system, config, given)
     if controller is not None and not loop.is_closed:
         raise InputError("--controller: expected the recording of a closed loop, got an open one")
-    report = _report_loop(loop, page, [] if every is None else _over_time(loop, every))
+    report = _report_loop(loop, page, [] if every is None else _over_time(loop, every), fade_level)
     if controller is not None:
         _learn(loop, report.observed, controller)
 
 
-def _report_loop(loop: Recording, page: Path, pieces: list[Piece]) -> LoopReport:
+def _report_loop(loop: Recording, page: Path, pieces: list[Piece], fade_level: float) -> LoopReport:
     """Write the page and the numbers of a loop."""
     from faintspot.loop.telemetry.page import page_of_loop, table_of_pieces
     from faintspot.loop.telemetry.report import report_of_loop
 
-    report = report_of_loop(loop, lambda step: click.echo(f"{step} ...", err=True))
+    report = report_of_loop(loop, lambda step: click.echo(f"{step} ...", err=True), fade_level=fade_level)
     numbers = derived(page, ".json")
     write_atomically(numbers, to_json(report.as_values(), indent=1))
     page_of_loop(report, pieces).write(page)

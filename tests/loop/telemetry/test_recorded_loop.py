@@ -23,7 +23,7 @@ from faintspot.loop.control.identification.preparation import prepared
 from faintspot.loop.control.identification.recording import NUMBERS, Recording
 from faintspot.loop.telemetry.page import page_of_loop
 from faintspot.loop.telemetry.recorded_loop import frame_rate, read_recorded_loop
-from faintspot.loop.telemetry.report import report_of_loop
+from faintspot.loop.telemetry.report import _begun, _scintillation, report_of_loop
 
 WORDS = """
 slope_unit = "px"
@@ -50,6 +50,26 @@ def test_npz_with_words(tmp_path: Path) -> None:
     np.savez(tmp_path / "night.npz", **arrays())
     (tmp_path / "system.toml").write_text(WORDS)
     same(read_recorded_loop(tmp_path / "night.npz", tmp_path / "system.toml"))
+
+
+@pytest.mark.usefixtures("undrawn_pictures")
+def test_fluxes_have_a_part_of_the_report(tmp_path: Path) -> None:
+    rng, found = np.random.default_rng(1), arrays()
+    light = np.exp(0.4 * np.sin(np.arange(2550) / 7.0))[:, None]
+    np.savez(tmp_path / "night.npz", **found, flux=rng.poisson(200 * light, (2550, 25)))
+    (tmp_path / "system.toml").write_text(WORDS)
+    loop = read_recorded_loop(tmp_path / "night.npz", tmp_path / "system.toml")
+    _, report = _begun(loop)
+    _scintillation(report, 0.8)
+    index = report.parts["scintillation"].values[0]
+    assert index.value == pytest.approx((light.std() / light.mean()) ** 2, rel=0.1)
+    assert len(report.as_values()["scintillation"]["of_subapertures"]) == 25
+    assert "scintillation" in {section.name for section in page_of_loop(report).sections}
+    with pytest.raises(InputError):
+        report_of_loop(loop, fade_level=0.0)
+    with pytest.raises(InputError):
+        replace(loop, flux=loop.flux[:, 1:])
+    assert "scintillation" not in _begun(replace(loop, flux=None))[1].parts
 
 
 def test_slopes_that_are_not_valid_are_left_out(tmp_path: Path) -> None:

@@ -1,6 +1,7 @@
 """Measurements from the telemetry of loops. Read in this order.
 
 `recorded_loop` (a loop of any system from its file), `spectra` (also of what slopes cannot show), `choices`
-(other controllers by replay), `report`, `page`. `recording` prepares telemetry of this engine for learning.
-Of methods that alternated, `alternation` gives the residual phase of each turn, and their centroid gains.
+(other controllers by replay), `scintillation` (of the fluxes), `report`, `page`. `recording` prepares
+telemetry of this engine for learning. Of methods that alternated, `alternation` gives the residual phase of
+each turn, and their centroid gains.
 """

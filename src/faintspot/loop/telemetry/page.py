@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from faintspot.base.arrays import Floats
 from faintspot.base.checks import number_between
 from faintspot.base.errors import InputError
 from faintspot.base.files import csv_text
@@ -119,6 +120,7 @@ def page_of_loop(report: LoopReport, pieces: Sequence[Piece] = ()) -> Report:
     more: dict[str, Sequence[str] | Table | FigureWithData | None] = {
         "frames": loop.remarks,
         "noise": _noise_figure(report),
+        "scintillation": _scintillation_figure(report),
         "spectra": _spectra_figure(report),
         "choices": _choices_table(report),
     }
@@ -204,14 +206,29 @@ def _noise_figure(report: LoopReport) -> FigureWithData | None:
 def _noise_pictures(report: LoopReport) -> list[Picture]:
     if report.noise_px is None or report.loop.cells is None or len(report.loop.cells) == 1:
         return []
-    cells, halves = report.loop.cells - report.loop.cells.min(axis=0), report.noise_px.reshape(2, -1)
-    limits, unit = {"vmin": np.nanmin(halves), "vmax": np.nanmax(halves)}, report.loop.slope_unit
-    pictures = []
-    for values, name in zip(halves, "xy", strict=True):
-        grid = np.full(cells.max(axis=0) + 1, np.nan)
-        grid[tuple(cells.T)] = values
-        pictures.append(Picture(grid, f"noise ({unit})", f"noise of {name}", "column", "row", limits))
-    return pictures
+    halves, unit = report.noise_px.reshape(2, -1), report.loop.slope_unit
+    limits = {"vmin": np.nanmin(halves), "vmax": np.nanmax(halves)}
+    return [
+        _map(report, values, f"noise ({unit})", f"noise of {name}", limits)
+        for values, name in zip(halves, "xy", strict=True)
+    ]
+
+
+def _scintillation_figure(report: LoopReport) -> FigureWithData | None:
+    """Draw the scintillation index of each sub-aperture."""
+    found = report.scintillation
+    if found is None or not (found.index > 2 * found.index_error).any():
+        return None
+    picture = _map(report, found.index, "index", "scintillation index", {"vmin": 0.0})
+    return _TEXT.figure("scintillation", [[picture]], 4.0, width=WIDTH * 0.4)
+
+
+def _map(report: LoopReport, values: Floats, unit: str, title: str, limits: dict[str, Any]) -> Picture:
+    """Return a picture of values of each sub-aperture."""
+    cells = report.loop.cells - report.loop.cells.min(axis=0)
+    grid = np.full(cells.max(axis=0) + 1, np.nan)
+    grid[tuple(cells.T)] = values
+    return Picture(grid, unit, title, "column", "row", limits)
 
 
 def _spectra_figure(report: LoopReport) -> FigureWithData | None:

@@ -41,12 +41,13 @@ UNITS = {"px": None, "arcsec": 1.0, "rad": 1 / ARCSEC}
 """Units of slopes, in arcsec."""
 _OF_AOT = {"pix": "px", "pixel": "px", "px": "px", "arcsec": "arcsec", "rad": "rad"}
 _ARRAYS = (
-    *("slopes", "commands", "interaction_matrix", "control_matrix", "cells", "time_s", "frame", "flags"),
+    *("slopes", "commands", "interaction_matrix", "control_matrix", "cells"),
+    *("time_s", "frame", "flags", "flux"),
     *OFFSETS,
 )
 _OF_SENSOR = (
     *("frame", "cells", "diameter_m", "pixel_scale_arcsec", "subaperture_m"),
-    *("commands", "control_matrix", "frame_rate_hz", "delay_frames"),
+    *("commands", "control_matrix", "frame_rate_hz", "delay_frames", "flux"),
 )
 _SCALES = ("pixel_scale_arcsec", "subaperture_m", "diameter_m")
 """Scales of the telescope that a layout holds."""
@@ -174,6 +175,7 @@ def _of_store(path: Path, configuration: str | Path | None) -> dict[str, Any]:
     values: dict[str, Any] = {
         "slopes": recording.slopes[rows].astype(np.float64),
         "flags": recording.flags[rows],
+        "flux": recording.flux[rows],
         "slope_unit": "px",
         "frame": recording.frame[rows],
         "time_s": recording.last_row_time_ns[rows] / 1e9,
@@ -227,6 +229,7 @@ def _of_slopes(path: Path) -> dict[str, Any]:
     values: dict[str, Any] = {
         "slopes": np.hstack([along, across]),
         "flags": run.stored.variables["flags"] & ~np.uint8(run.keep | usable),
+        "flux": run.stored.variables["flux"],
         "slope_unit": "px",
         "cells": layout.cells,
         "loop": "open",
@@ -315,6 +318,7 @@ def _loop(name: str, values: dict[str, Any], given: list[str]) -> Recording:
         cells_of(cells, n) if has_cells else None,
         **known,
         frame=frame,
+        flux=values.get("flux"),
         is_closed=one_of("loop", values.get("loop", "closed"), ("closed", "open")) == "closed",
         slope_unit=unit,
         name=name,

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from faintspot.base.arrays import Floats
+from faintspot.base.checks import number_between
 from faintspot.base.errors import InputError
 from faintspot.base.report.texts import Texts
 from faintspot.loop.control.identification.layers import Identification, Identified
@@ -40,11 +41,12 @@ from faintspot.slopes.sensor.pupil import subapertures_across
 if TYPE_CHECKING:
     from faintspot.loop.control.identification.learnt_loop import ObservedLoop
     from faintspot.loop.telemetry.choices import ControlChoice
+    from faintspot.loop.telemetry.scintillation import Scintillation
 
 
 _TEXT = Texts("faintspot.loop.telemetry")
-_PARTS = ("frames", "loop", "noise", "turbulence", "vibrations", "spectra", "choices")
-_OF_TURBULENCE = _PARTS[3:]
+_PARTS = ("frames", "loop", "noise", "scintillation", "turbulence", "vibrations", "spectra", "choices")
+_OF_TURBULENCE = _PARTS[4:]
 _TIMES_AT_LIMIT = 3  # that a largest value occurs, to be taken for a limit
 _MOST_UNMEASURED = 0.2  # of the slopes; large ones are missed most, so that the others vary too little
 _LEAST_GAIN = 0.5  # of the usual one, with which commands follow slopes in a piece
@@ -71,6 +73,7 @@ class LoopReport:
     noise_px: Floats | None = None
     """(2 n,): standard deviation of each slope's noise, in the unit of the slopes."""
     noise_error_px: Floats | None = None
+    scintillation: Scintillation | None = None
     turbulence: Identified | None = None
     spectra: ModalSpectra | None = None
     choices: list[ControlChoice] = field(default_factory=list)
@@ -110,6 +113,9 @@ class LoopReport:
             values["noise"]["of_slopes_error"] = _rounded(self.noise_error_px)
             if not np.isfinite(self.noise_px).all():
                 values["noise"]["of_slopes_unknown"] = "null: not measured in five consecutive frames"
+        if self.scintillation is not None:
+            values["scintillation"]["of_subapertures"] = _rounded(self.scintillation.index)
+            values["scintillation"]["of_subapertures_error"] = _rounded(self.scintillation.index_error)
         values["choices"]["compared"] = [choice.as_values() for choice in self.choices]
         return {
             "recording": self.loop.name,
@@ -122,7 +128,11 @@ class LoopReport:
 
 
 def report_of_loop(
-    loop: Recording, progress: Callable[[str], None] = lambda _: None, *, compare: bool = True
+    loop: Recording,
+    progress: Callable[[str], None] = lambda _: None,
+    *,
+    compare: bool = True,
+    fade_level: float = 0.5,
 ) -> LoopReport:
     """Analyse a recorded loop.
 
@@ -133,13 +143,18 @@ def report_of_loop(
         Called with the name of each step.
     compare : bool
         Whether other choices of control are replayed, and parts of the recording compared.
+    fade_level : float
+        Flux of the aperture below which its light fades, relative to the mean.
 
     Raises
     ------
     InputError
-        When the slopes do not vary, or commands and slopes are not of one loop.
+        When the slopes do not vary, commands and slopes are not of one loop, or the level is not a share.
     """
     ready, report = _begun(loop)
+    if loop.flux is not None:
+        progress("scintillation")
+        _scintillation(report, number_between("fade_level", fade_level, 0.0, 1.0, low_open=True))
     progress("delay")
     delay = _loop(report, in_parts=compare)
     progress("noise")
@@ -167,7 +182,8 @@ def noise_of_loop(loop: Recording) -> LoopReport:
 def _begun(loop: Recording) -> tuple[Prepared, LoopReport]:
     """Return the recording in one convention, and a report on its frames."""
     ready = prepared(replace(loop, remarks=()))  # a controller that is learnt describes itself, not the files
-    parts = {name: Part(_TEXT[f"{name}.title"]) for name in _PARTS}
+    names = [name for name in _PARTS if name != "scintillation" or loop.flux is not None]
+    parts = {name: Part(_TEXT[f"{name}.title"]) for name in names}
     remarks = (*loop.remarks, *ready.recording.remarks)
     report = LoopReport(replace(ready.recording, remarks=remarks), parts)
     report.doubts += filter(None, [order_doubt(ready.recording)])
@@ -189,6 +205,18 @@ def _frames(report: LoopReport) -> None:
     missing = 1 - np.isfinite(loop.slopes).any(axis=1).sum() / (loop.frame[-1] - loop.frame[0] + 1)
     if missing > _MOST_UNMEASURED:
         report.doubts.append(_TEXT("doubts.missing", share=missing))
+
+
+def _scintillation(report: LoopReport, fade_level: float) -> None:
+    from faintspot.loop.telemetry.scintillation import measure_scintillation  # few recordings hold fluxes
+
+    loop, part = report.loop, report.parts["scintillation"]
+    try:
+        found = measure_scintillation(loop.flux, loop.frame_rate_hz, fade_level, loop.frame)
+    except InputError as error:
+        part.missing = f"{error}."
+        return
+    report.scintillation, part.values = found, found.values
 
 
 def _loop(report: LoopReport, *, in_parts: bool) -> LoopDelay:

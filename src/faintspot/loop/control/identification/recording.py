@@ -67,6 +67,8 @@ class LoopFrames:
     """(frames, 2 n): of the slopes. Default: their noise is measured, the same in all frames."""
     covariance_xy: Any = None
     """(frames, n): covariance of the errors of x and y. Default: 0."""
+    flux: Any = None
+    """(frames, n): flux of each sub-aperture, any unit. Default: not recorded."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -179,6 +181,7 @@ class Recording(LoopSystem, LoopFrames):
             frame=frame,
             standard_errors=_array("standard_errors", self.standard_errors, is_positive=True),
             covariance_xy=_array("covariance_xy", self.covariance_xy),
+            flux=_array("flux", self.flux),
             cells=None if self.cells is None else cells_of(self.cells, slopes.shape[1] // 2),
             remarks=strings_of("remarks", self.remarks),
         )
@@ -190,11 +193,12 @@ class Recording(LoopSystem, LoopFrames):
                 f"commands: expected {len(self.slopes)} frames, as of the slopes, got {len(self.commands)}"
             )
         frames, slopes = self.slopes.shape
-        for name in ("covariance_xy", "prior_std") if self.cells is None else ():
+        for name in ("covariance_xy", "flux", "prior_std") if self.cells is None else ():
             if getattr(self, name) is not None:
                 raise InputError(f"{name}: expected none without cells, got an array; give cells")
         shapes: dict[str, tuple[int, ...]] = dict.fromkeys(("prior_std", "reference_slopes"), (slopes,))
-        shapes |= {"standard_errors": (frames, slopes), "covariance_xy": (frames, slopes // 2)}
+        shapes |= dict.fromkeys(("covariance_xy", "flux"), (frames, slopes // 2))
+        shapes |= {"standard_errors": (frames, slopes)}
         if self.commands is not None:
             shapes |= {"flat_command": self.commands.shape[1:]}
         for name, shape in shapes.items():
