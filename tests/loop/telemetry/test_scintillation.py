@@ -82,6 +82,14 @@ def test_light_that_is_steady_is_not_seen_to_vary() -> None:
         assert (np.abs(found.index) < 5 * found.index_error).all()
 
 
+def test_light_without_noise_that_never_or_hardly_varies() -> None:
+    assert not any(
+        math.isfinite(each.value) for each in measure_scintillation(np.ones((800, 3)), 500.0).values
+    )
+    slow = 2 + np.sin(np.arange(800) / 400)[:, None] * np.ones(3)
+    assert not math.isfinite(measure_scintillation(slow, RATE_HZ).values[HALF].value)
+
+
 def test_lost_frames_and_dim_sub_apertures_do_no_harm() -> None:
     rng = np.random.default_rng(4)
     light = log_normal(rng, 0.2, 8000, correlation=5.0, is_smooth=True)

@@ -27,7 +27,7 @@ _LIT = 0.1  # of the flux of the brightest tenth, from which a sub-aperture coun
 _STUDENT = 2.093 / 1.96  # 95 % of so few pieces, over that of many
 _TO_FRAME = (3.0, -3.0, 1.0)  # a parabola through the covariances at lags of one to three frames, at lag 0
 _OF_LINE = 0.5  # of the difference to a straight line, as an error of the extrapolation
-_OF_NOISE = 0.025  # relative error of a frequency, of the noise that is taken off
+_OF_NOISE = 0.04  # relative error of a frequency, of the noise that is taken off
 _FEWEST_FADES = 20
 _MOST_MADE = 0.2  # of the frames below the level, by as much noise again
 _MOST_NOISE = 0.08  # of the change of the light from frame to frame
@@ -50,7 +50,7 @@ def measure_scintillation(
     """Return scintillation indices without noise, how fast the light varies, and its fades.
 
     Light that is the same in no two frames in a row is taken for noise: the frames must be several times
-    faster than the scintillation.
+    faster than the scintillation. Errors hold where the recording has hundreds of its fluctuations.
 
     Parameters
     ----------
@@ -200,6 +200,8 @@ def _half_width(pieces: _Pieces, rate_hz: float) -> Measured:
         kept = weights * pieces.whole
         covariance = pieces.covariances(weights)[0] - pieces.index(weights)
         power = np.cumsum(sides * (kept @ spectra / kept.sum() - covariance[:-1].mean() / length))
+        if not power[-1] > 0:
+            return np.array([np.nan])
         above = int(np.argmax(power >= 0.5 * power[-1]))
         before = power[above - 1] if above else 0.0
         low = edges[above - 1] if above else 0.0
@@ -211,6 +213,10 @@ def _half_width(pieces: _Pieces, rate_hz: float) -> Measured:
     value, error = (float(part[0]) for part in _jackknife(half))
     if not value > 2 * error:
         return Measured(name, unit, remark="not found: the light varies too little")
+    if value < rate_hz / length:
+        return Measured(
+            name, unit, remark=f"below {rate_hz / length:.2g} Hz: too slow for so short a recording"
+        )
     return Measured(name, unit, value, math.hypot(error, _OF_NOISE * value))
 
 
@@ -218,11 +224,8 @@ def _fades(pieces: _Pieces, rate_hz: float, level: float) -> list[Measured]:
     """Return share and mean length of the fades of the aperture's light, where noise makes and ends few."""
     names = f"share of frames below {level:g} of the mean", "mean length of a fade"
     every = np.ones(_PIECES)
-    light, covariance, index = (
-        1 + pieces.light[:, -1],
-        pieces.covariances(every)[:, -1],
-        pieces.index(every)[-1],
-    )
+    light = 1 + pieces.light[:, -1]
+    covariance, index = pieces.covariances(every)[:, -1], pieces.index(every)[-1]
     noise, step = math.sqrt(max(covariance[0] - index, 0.0)), math.sqrt(max(2 * (index - covariance[1]), 0.0))
     noisier = light + noise * np.random.default_rng(1).standard_normal(len(light))
     below = light < level
