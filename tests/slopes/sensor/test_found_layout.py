@@ -11,7 +11,6 @@ from tests.slopes.sensor.sensor_cases import RATIOS, spot_frame
 
 import faintspot as fs
 from faintspot import Layout
-from faintspot.base.errors import DoubtWarning
 from faintspot.slopes.sensor.found_layout import find_illuminated, find_layout
 from faintspot.slopes.simulate import Detector, sensor_frames
 
@@ -104,9 +103,6 @@ def test_spots_at_their_window_s_edge_and_unlike_their_neighbours_are_doubtful()
     assert not found.clipped.any()
     narrow = find_layout(frame, pixels=11)
     assert narrow.clipped[moved]
-    with pytest.warns(DoubtWarning):
-        layout = fs.Layout.from_frame(frame, pixels=11)
-    assert layout.doubts == narrow.doubts
     assert not narrow[np.arange(len(narrow.layout)) != moved].unlike.any()
 
 
@@ -158,7 +154,7 @@ def test_lit_spots_in_no_sub_aperture_are_counted() -> None:
     truth = comatic(0.0, seed=3)
     at = np.append(truth.spots, [14.0 + 17.0j, 270.0 + 21.0j])
     frame = spot_frame(at, truth.frame.shape, flux_e=4000.0, width_px=1.4)
-    assert find_layout(frame).layout.spots_left_out == 2
+    assert fs.Layout.from_frame(frame).spots_left_out == 2
     cut = find_layout(frame[:, :-30])
     assert cut.layout.spots_left_out == 2 + len(cut.cut) > 2
 

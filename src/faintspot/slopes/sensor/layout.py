@@ -339,17 +339,16 @@ class Layout(ConfigurationTable, table="layout"):
         Layout
             Illuminated sub-apertures whose windows are within the frame. Windows are centred on the lattice
             of the spots, unless shifted, or following spots moved by over a quarter of the pitch; `centres`
-            contain the lattice. What may be wrong is in `doubts`, of which `DoubtWarning` warns.
-            `faintspot.slopes.sensor.found_layout.find_layout` lists the spots left out.
+            contain the lattice. `faintspot.slopes.sensor.found_layout.find_layout` lists the spots left out.
 
         Raises
         ------
         InputError
             If no regular array of spots is found.
         """
-        from faintspot.slopes.sensor.found_layout import find_layout
+        from faintspot.slopes.sensor.windows import find_windows
 
-        found = find_layout(
+        found = find_windows(
             frame,
             pixels=pixels,
             move_windows=move_windows,
@@ -357,10 +356,7 @@ class Layout(ConfigurationTable, table="layout"):
             bad_pixels=bad_pixels,
             **options,
         )
-        if found.doubts:
-            text = f"doubtful layout: {'; '.join(found.doubts)} (look at layout.plot(frame))"
-            warnings.warn(text, DoubtWarning, stacklevel=2)
-        return replace(found.layout, doubts=found.doubts)
+        return cls.of_windows(found)
 
     @classmethod
     def of_windows(cls, found: Windows) -> Layout:
