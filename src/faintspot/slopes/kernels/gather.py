@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from faintspot.base.checks import LARGEST_FLOAT32
 from faintspot.slopes.kernels.compiling import compiled, inlined
 from faintspot.slopes.kernels.simd import (
+    Lanes,
     absolute,
     copy_transposed,
     get,
@@ -50,7 +51,7 @@ class Frames(NamedTuple):
 
 
 @inlined
-def pixels_of(lanes: Any, frames: Any, offset: Any) -> Any:
+def pixels_of(lanes: Lanes, frames: Frames, offset: Any) -> Any:
     """Return W consecutive pixels of frames, as numbers of the lanes' type."""
     if frames.are_counts:
         return widened(lanes, frames.counts, offset)
@@ -59,7 +60,7 @@ def pixels_of(lanes: Any, frames: Any, offset: Any) -> Any:
 
 @compiled
 def gather_raw(
-    lanes: Any, frames: Any, frame: Any, corners: Any, ny: Any, nx: Any, block: Any, image: Any
+    lanes: Lanes, frames: Frames, frame: Any, corners: Any, ny: int, nx: int, block: Any, image: Any
 ) -> None:
     """Copy W sub-apertures of a frame into the lanes, as they are.
 
@@ -82,7 +83,7 @@ def gather_raw(
 
 @compiled
 def _gather(
-    lanes: Any, frames: Any, frame: Any, corners: Any, ny: Any, nx: Any, block: Any, image: Any
+    lanes: Lanes, frames: Any, frame: Any, corners: Any, ny: int, nx: int, block: Any, image: Any
 ) -> None:
     """See `gather_raw`; of frames of one type."""
     width = width_of(lanes)
@@ -107,7 +108,7 @@ def _gather(
 
 @compiled
 def calibrate(
-    lanes: Any, image: Any, pixels: Any, calibration: Any, place: Any, saturation: Any, lane_values: Any
+    lanes: Lanes, image: Any, pixels: Any, calibration: Any, place: Any, saturation: Any, lane_values: Any
 ) -> None:
     """Turn a group's raw images into electrons, in place: (raw - dark) * scale.
 
@@ -139,7 +140,7 @@ def calibrate(
 
 
 @compiled
-def fill_bad_pixels(width: Any, lane: Any, ny: Any, nx: Any, image: Any, original: Any) -> None:
+def fill_bad_pixels(width: int, lane: int, ny: int, nx: int, image: Any, original: Any) -> None:
     """Give every NaN of a lane the mean of its good neighbours (up to 8), else of all good pixels, else 0.
 
     `original` is scratch for ny * nx numbers.
@@ -167,7 +168,7 @@ def fill_bad_pixels(width: Any, lane: Any, ny: Any, nx: Any, image: Any, origina
 
 
 @compiled
-def gather_images(width: Any, images: Any, first: Any, image: Any) -> None:
+def gather_images(width: int, images: Any, first: int, image: Any) -> None:
     """Copy W images of a stack (n, pixels) into the lanes; the last one fills those that are left."""
     n, pixels = images.shape
     for lane in range(width):
@@ -177,7 +178,7 @@ def gather_images(width: Any, images: Any, first: Any, image: Any) -> None:
 
 
 @compiled
-def scatter_images(width: Any, image: Any, first: Any, images: Any) -> None:
+def scatter_images(width: int, image: Any, first: int, images: Any) -> None:
     """Copy the lanes into a stack (n, pixels), as far as it has images."""
     n, pixels = images.shape
     for lane in range(min(width, n - first)):

@@ -144,7 +144,7 @@ def new_scratch(lanes: Lanes, ny: int, nx: int, own: tuple[Any, ...] = ()) -> Sc
 
 
 @compiled
-def gather_group(source: Any, f: Any, first: Any, scratch: Any) -> None:
+def gather_group(source: Source, f: int, first: int, scratch: Scratch) -> None:
     """Gather and calibrate the W sub-apertures of a group; write counts of bad and saturated pixels."""
     lanes, ny, nx = source.lanes, source.ny, source.nx
     width = width_of(lanes)
@@ -158,7 +158,7 @@ def gather_group(source: Any, f: Any, first: Any, scratch: Any) -> None:
 
 
 @compiled
-def prepare_group(source: Any, f: Any, first: Any, settings: Any, scratch: Any) -> None:
+def prepare_group(source: Source, f: int, first: int, settings: Any, scratch: Scratch) -> None:
     """Gather and calibrate a group, fill bad pixels and set the flags of bad and saturated pixels."""
     width, ny, nx = width_of(source.lanes), source.ny, source.nx
     gather_group(source, f, first, scratch)
@@ -173,7 +173,7 @@ def prepare_group(source: Any, f: Any, first: Any, settings: Any, scratch: Any) 
 
 
 @inlined
-def place_of(source: Any, item: Any) -> Any:
+def place_of(source: Source, item: Any) -> Any:
     """Return the frame of a group, and its first sub-aperture."""
     width = width_of(source.lanes)
     n_groups = (source.corners.shape[0] + width - 1) // width
@@ -188,8 +188,8 @@ def _within(slope: Any, reach: Any) -> Any:
 
 @compiled
 def store_slope(
-    f: Any,
-    s: Any,
+    f: int,
+    s: int,
     settings: Any,
     x: Any,
     y: Any,
@@ -199,7 +199,7 @@ def store_slope(
     bits: Any,
     iterations: Any,
     bad_pixels: Any,
-    slopes: Any,
+    slopes: SlopeArrays,
 ) -> None:
     """Write all of one sub-aperture but the covariance; its position is the reference where it is invalid."""
     slopes.flux[f, s] = flux
@@ -222,7 +222,7 @@ def store_slope(
 
 
 @compiled
-def store_covariance(f: Any, s: Any, settings: Any, covariance: Any, slopes: Any) -> None:
+def store_covariance(f: int, s: int, settings: Any, covariance: Any, slopes: SlopeArrays) -> None:
     """Write the covariance of x and y, at most the product of the errors that `store_slope` wrote; or 0."""
     largest = slopes.standard_error_x[f, s] * slopes.standard_error_y[f, s]
     scale = settings[ERROR_SCALE, s]
@@ -231,7 +231,7 @@ def store_covariance(f: Any, s: Any, settings: Any, covariance: Any, slopes: Any
 
 
 @compiled
-def _store_group(width: Any, n: Any, group: Any, scratch: Any, slopes: Any) -> None:
+def _store_group(width: int, n: Any, group: Group, scratch: Scratch, slopes: SlopeArrays) -> None:
     """Write the results of a group."""
     f, found = group.frame, scratch.results
     for lane in range(min(width, n - group.first)):
@@ -255,7 +255,7 @@ def _store_group(width: Any, n: Any, group: Any, scratch: Any, slopes: Any) -> N
         store_covariance(f, group.first + lane, group.settings, found[COVARIANCE * width + lane], slopes)
 
 
-def locate(group: Any, tables: Any, scratch: Any, stages: Any) -> None:
+def locate(group: Group, tables: Any, scratch: Scratch, stages: Any) -> None:
     """Placeholder for an estimator's own kernel, which `driver_of` inserts.
 
     It reads `scratch.image` and writes `scratch.results`, `scratch.iterations` and bits of `scratch.flags`;
@@ -264,7 +264,7 @@ def locate(group: Any, tables: Any, scratch: Any, stages: Any) -> None:
 
 
 def measure_groups(
-    source: Any, task: Any, start: Any, stop: Any, scratch: Any, slopes: Any, stages: Any
+    source: Source, task: Task, start: int, stop: int, scratch: Scratch, slopes: SlopeArrays, stages: Any
 ) -> None:
     """Compute the slopes of the groups [start, stop) of a block of frames.
 
@@ -316,7 +316,7 @@ def copied(template: Any, kernel: Any, **replaced: Any) -> Any:
 
 
 @compiled
-def flux_of_groups(source: Any, start: Any, stop: Any, scratch: Any, flux: Any) -> None:
+def flux_of_groups(source: Source, start: int, stop: int, scratch: Scratch, flux: Any) -> None:
     """Sum the pixels of every sub-aperture, electrons, bad ones as 0, into (n_frames, n_subapertures)."""
     for item in range(start, stop):
         f, first = place_of(source, item)
@@ -329,7 +329,7 @@ def flux_of_groups(source: Any, start: Any, stop: Any, scratch: Any, flux: Any) 
 
 
 @compiled
-def flux_above_edges(source: Any, start: Any, stop: Any, scratch: Any, flux: Any) -> None:
+def flux_above_edges(source: Source, start: int, stop: int, scratch: Scratch, flux: Any) -> None:
     """Sum the pixels of each sub-aperture like `flux_of_groups`, above the mean of its outermost pixels."""
     lanes, ny, nx = source.lanes, source.ny, source.nx
     zero, one = splat(lanes, 0.0), splat(lanes, 1.0)
@@ -351,7 +351,7 @@ def flux_above_edges(source: Any, start: Any, stop: Any, scratch: Any, flux: Any
 
 
 @inlined
-def _store_flux(lanes: Any, total: Any, f: Any, first: Any, scratch: Any, flux: Any) -> None:
+def _store_flux(lanes: Lanes, total: Any, f: int, first: int, scratch: Scratch, flux: Any) -> None:
     """Write the flux of a group."""
     store(scratch.results, 0, total)
     for lane in range(min(width_of(lanes), flux.shape[1] - first)):

@@ -67,7 +67,7 @@ def add_products(columns: Any, vectors: Any, out: Any) -> None:
 
 
 @compiled
-def add_changes(columns: Any, vector: Any, taken: Any, out: Any, start: Any, stop: Any) -> None:
+def add_changes(columns: Any, vector: Any, taken: Any, out: Any, start: int, stop: int) -> None:
     """Add the product with what elements [start, stop) of a vector differ from those taken before.
 
     Parameters
@@ -105,7 +105,7 @@ def is_measured(x: Any, y: Any, flags: Any) -> Any:
 
 
 @compiled
-def add_slopes(part: Any, x: Any, y: Any, flags: Any, start: Any, stop: Any) -> None:
+def add_slopes(part: ProductPart, x: Any, y: Any, flags: Any, start: int, stop: int) -> None:
     """Add the product with the slopes of sub-apertures [start, stop), which have been measured.
 
     What is not finite, or far too large, is left for `finish_product`: the sum stays finite, also that of a

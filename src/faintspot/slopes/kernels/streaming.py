@@ -19,9 +19,9 @@ from llvmlite import ir
 from numba.core import types
 
 from faintspot.slopes.kernels.compiling import compiled
-from faintspot.slopes.kernels.groups import copied
+from faintspot.slopes.kernels.groups import SlopeArrays, Source, Task, copied
 from faintspot.slopes.kernels.ordered import look_at, now_ns, sleep_ns
-from faintspot.slopes.kernels.products import add_slopes
+from faintspot.slopes.kernels.products import ProductPart, add_slopes
 from faintspot.slopes.kernels.simd import intrinsic, width_of
 
 LOOKS_BETWEEN_STOPS = 1024  # at the progress, between two looks at whether to give up
@@ -103,7 +103,7 @@ def wait_for_rows(
 
 
 @compiled
-def sleep_until_due(arrival: Any, frame: Any, rows: Any, item: Any) -> Any:
+def sleep_until_due(arrival: Arrival, frame: Any, rows: Any, item: Any) -> Any:
     """Sleep until shortly before a group's rows are due; return whether to rehearse before they come.
 
     That is when the thread has slept since the last rehearsal, and there is time for one.
@@ -132,7 +132,7 @@ def sleep_until_due(arrival: Any, frame: Any, rows: Any, item: Any) -> Any:
 
 
 @compiled
-def wait_for_group(arrival: Any, frame: Any, rows: Any, item: Any) -> Any:
+def wait_for_group(arrival: Arrival, frame: Any, rows: Any, item: Any) -> Any:
     """Wait for a group's rows, and learn when they come; return whether they are there."""
     cells = arrival.cells, arrival.frame_cell, arrival.rows_cell
     if rows_are_there(*cells, frame, rows):
@@ -147,7 +147,7 @@ def wait_for_group(arrival: Any, frame: Any, rows: Any, item: Any) -> Any:
 
 @compiled
 def multiply_until(
-    arrival: Any, frame: Any, rows: Any, item: Any, width: Any, slopes: Any, part: Any
+    arrival: Arrival, frame: Any, rows: Any, item: Any, width: int, slopes: SlopeArrays, part: ProductPart
 ) -> None:
     """Add products of groups before `item`, until the rows are there; of `width` sub-apertures each.
 
@@ -166,22 +166,24 @@ def multiply_until(
         pace[PENDING] += 1
 
 
-def measure(source: Any, task: Any, start: Any, stop: Any, scratch: Any, slopes: Any, stages: Any) -> None:
+def measure(
+    source: Source, task: Task, start: int, stop: int, scratch: Any, slopes: SlopeArrays, stages: Any
+) -> None:
     """Stand for the compiled function that measures groups, which `streamed` puts in its place."""
 
 
 def stream_groups(
-    arrival: Any,
+    arrival: Arrival,
     frame: Any,
     last_rows: Any,
-    source: Any,
-    task: Any,
-    start: Any,
-    stop: Any,
+    source: Source,
+    task: Task,
+    start: int,
+    stop: int,
     scratch: Any,
-    slopes: Any,
+    slopes: SlopeArrays,
     stages: Any,
-    part: Any,
+    part: ProductPart,
 ) -> Any:
     """Measure the groups [start, stop) of a frame while it arrives, and begin the product with their slopes.
 

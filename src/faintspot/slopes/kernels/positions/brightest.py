@@ -5,6 +5,7 @@ from typing import Any
 
 from faintspot.slopes.kernels.compiling import compiled, inlined
 from faintspot.slopes.kernels.simd import (
+    Lanes,
     absolute,
     any_lane,
     load,
@@ -20,7 +21,7 @@ from faintspot.slopes.kernels.simd import (
 
 
 @compiled
-def gather_taps(width: Any, first: Any, taps: Any, lane_taps: Any) -> None:
+def gather_taps(width: int, first: Any, taps: Any, lane_taps: Any) -> None:
     """Put the taps (n_subapertures, 2, 1 + reach) of a group side by side: (2, 1 + reach, W)."""
     n, _, count = taps.shape
     for lane in range(width):
@@ -32,7 +33,7 @@ def gather_taps(width: Any, first: Any, taps: Any, lane_taps: Any) -> None:
 
 @compiled
 def smooth_pixel(
-    lanes: Any, image: Any, at: Any, step: Any, place: Any, n: Any, taps: Any, axis: Any, reach: Any
+    lanes: Lanes, image: Any, at: Any, step: Any, place: Any, n: Any, taps: Any, axis: Any, reach: Any
 ) -> Any:
     """One pixel smoothed along one axis; `place` of n counts along it, `step` elements lie between two.
 
@@ -52,7 +53,7 @@ def smooth_pixel(
 
 @compiled
 def smooth_group(
-    lanes: Any, image: Any, ny: Any, nx: Any, reach: Any, taps: Any, half_done: Any, output: Any
+    lanes: Lanes, image: Any, ny: int, nx: int, reach: Any, taps: Any, half_done: Any, output: Any
 ) -> None:
     """Smooth whole images along x, into `half_done`, then along y."""
     width = width_of(lanes)
@@ -71,7 +72,7 @@ SMALLEST_VARIANCE = 1e-4
 
 
 @compiled
-def variance_of(lanes: Any, variances: Any, at: Any, mean: Any) -> Any:
+def variance_of(lanes: Lanes, variances: Any, at: Any, mean: Any) -> Any:
     """Return the variance of the pixel at element `at`; `mean` where it is the same in all."""
     if variances is None:
         return mean
@@ -79,7 +80,7 @@ def variance_of(lanes: Any, variances: Any, at: Any, mean: Any) -> Any:
 
 
 @compiled
-def weight_variance_of(lanes: Any, variances: Any, at: Any, mean: Any, weight: Any) -> Any:
+def weight_variance_of(lanes: Lanes, variances: Any, at: Any, mean: Any, weight: Any) -> Any:
     """Return the variance that weighs the pixel at `at`; `weight` weighs a pixel of variance `mean`."""
     if variances is None:
         return weight
@@ -88,7 +89,7 @@ def weight_variance_of(lanes: Any, variances: Any, at: Any, mean: Any, weight: A
 
 
 @compiled
-def relative_variance(lanes: Any, variances: Any, at: Any, mean: Any) -> Any:
+def relative_variance(lanes: Lanes, variances: Any, at: Any, mean: Any) -> Any:
     """Return the variance of the pixel at `at` in units of `mean`, neither below the smallest."""
     if variances is None:
         return splat(lanes, 1.0)
@@ -98,7 +99,7 @@ def relative_variance(lanes: Any, variances: Any, at: Any, mean: Any) -> Any:
 
 @compiled
 def without_noisy_pixels(
-    lanes: Any, variances: Any, place: Any, pixels: Any, mean: Any, image: Any, damped: Any
+    lanes: Lanes, variances: Any, place: Any, pixels: Any, mean: Any, image: Any, damped: Any
 ) -> Any:
     """Return an image in which pixels noisier than the mean variance count less, by the ratio of variances.
 
@@ -132,7 +133,7 @@ _COUNTING_PASSES = 24  # usually 5 to 8 are enough; outliers go on to the exact 
 
 
 @inlined
-def _tally(lanes: Any, image: Any, at: Any, pivot: Any, count: Any, total: Any) -> Any:
+def _tally(lanes: Lanes, image: Any, at: Any, pivot: Any, count: Any, total: Any) -> Any:
     """Add one pixel to number and sum of those above the pivot."""
     g = load(lanes, image, at)
     above = g > pivot
@@ -140,7 +141,7 @@ def _tally(lanes: Any, image: Any, at: Any, pivot: Any, count: Any, total: Any) 
 
 
 @compiled
-def _sum_above(lanes: Any, image: Any, pixels: Any, pivot: Any) -> Any:
+def _sum_above(lanes: Lanes, image: Any, pixels: Any, pivot: Any) -> Any:
     """Return number and sum of the pixels above the pivot, in four independent sums."""
     width = width_of(lanes)
     zero = splat(lanes, 0.0)
@@ -157,7 +158,7 @@ def _sum_above(lanes: Any, image: Any, pixels: Any, pivot: Any) -> Any:
 
 
 @compiled
-def _range_and_sum(lanes: Any, image: Any, pixels: Any) -> Any:
+def _range_and_sum(lanes: Lanes, image: Any, pixels: Any) -> Any:
     """Return the smallest and the largest pixel, and the sum of all."""
     width = width_of(lanes)
     low = high = other_low = other_high = load(lanes, image, 0)
@@ -174,7 +175,7 @@ def _range_and_sum(lanes: Any, image: Any, pixels: Any) -> Any:
 
 
 @compiled
-def _middle(lanes: Any, low: Any, high: Any) -> Any:
+def _middle(lanes: Lanes, low: Any, high: Any) -> Any:
     """Return a number in [low, high), for low < high, near the middle."""
     half = splat(lanes, 0.5)
     middle = maximum(half * low + half * high, low)
@@ -182,7 +183,7 @@ def _middle(lanes: Any, low: Any, high: Any) -> Any:
 
 
 @inlined
-def _pivot(lanes: Any, mean: Any, low: Any, high: Any, wanted: Any) -> Any:
+def _pivot(lanes: Lanes, mean: Any, low: Any, high: Any, wanted: Any) -> Any:
     """Return a pivot in a bracket, with about the wanted fraction of the bracket's pixels above it.
 
     The mean parts them in halves. How far to go from it follows from the most variance that a distribution of
@@ -193,7 +194,7 @@ def _pivot(lanes: Any, mean: Any, low: Any, high: Any, wanted: Any) -> Any:
 
 
 @compiled
-def _bracket(lanes: Any, image: Any, pixels: Any, rank: Any, low: Any, high: Any, total: Any) -> Any:
+def _bracket(lanes: Lanes, image: Any, pixels: Any, rank: Any, low: Any, high: Any, total: Any) -> Any:
     """Part the RANK-th largest pixel from its neighbours in rank, or from all that differ from it.
 
     As quickselect does, but without moving pixels: count those above a pivot. Returns low and high, and how
@@ -225,7 +226,7 @@ def _bracket(lanes: Any, image: Any, pixels: Any, rank: Any, low: Any, high: Any
 
 
 @compiled
-def _ends(lanes: Any, image: Any, pixels: Any, low: Any, high: Any) -> Any:
+def _ends(lanes: Lanes, image: Any, pixels: Any, low: Any, high: Any) -> Any:
     """Return the smallest pixel above low, and the largest one not above high."""
     width = width_of(lanes)
     most, least = splat(lanes, math.inf), splat(lanes, -math.inf)
@@ -238,7 +239,7 @@ def _ends(lanes: Any, image: Any, pixels: Any, low: Any, high: Any) -> Any:
 
 
 @compiled
-def _step_exactly(lanes: Any, image: Any, pixels: Any, rank: Any, low: Any, high: Any) -> Any:
+def _step_exactly(lanes: Lanes, image: Any, pixels: Any, rank: Any, low: Any, high: Any) -> Any:
     """Halve the bracket [low, high] of the RANK-th largest pixel; its new ends are pixel values."""
     width = width_of(lanes)
     zero, one = splat(lanes, 0.0), splat(lanes, 1.0)
@@ -259,7 +260,7 @@ def _step_exactly(lanes: Any, image: Any, pixels: Any, rank: Any, low: Any, high
 
 
 @compiled
-def find_threshold(lanes: Any, image: Any, pixels: Any, lane_values: Any) -> None:
+def find_threshold(lanes: Lanes, image: Any, pixels: Any, lane_values: Any) -> None:
     """Find the RANK-th largest pixel of every lane, exactly, and the largest magnitude."""
     width = width_of(lanes)
     one = splat(lanes, 1.0)
@@ -276,7 +277,7 @@ def find_threshold(lanes: Any, image: Any, pixels: Any, lane_values: Any) -> Non
 
 
 @compiled
-def find_largest(lanes: Any, image: Any, pixels: Any, lane_values: Any) -> None:
+def find_largest(lanes: Lanes, image: Any, pixels: Any, lane_values: Any) -> None:
     """Find the largest magnitude of every lane."""
     width = width_of(lanes)
     largest = splat(lanes, 0.0)
@@ -286,7 +287,7 @@ def find_largest(lanes: Any, image: Any, pixels: Any, lane_values: Any) -> None:
 
 
 @compiled
-def subtract_background(lanes: Any, image: Any, pixels: Any, lane_values: Any, left: Any) -> None:
+def subtract_background(lanes: Lanes, image: Any, pixels: Any, lane_values: Any, left: Any) -> None:
     """Zero the pixels below THRESHOLD, and take it off the others where SUBTRACT is 1; `left` is written."""
     width = width_of(lanes)
     zero = splat(lanes, 0.0)
@@ -298,13 +299,13 @@ def subtract_background(lanes: Any, image: Any, pixels: Any, lane_values: Any, l
 
 
 @inlined
-def _from_middle(lanes: Any, i: Any, n: Any) -> Any:
+def _from_middle(lanes: Lanes, i: Any, n: Any) -> Any:
     """Return the position of pixel i of n [px]."""
     return splat(lanes, i - 0.5 * (n - 1))
 
 
 @compiled
-def _store_centre(lanes: Any, total: Any, moment_x: Any, moment_y: Any, lane_values: Any) -> Any:
+def _store_centre(lanes: Lanes, total: Any, moment_x: Any, moment_y: Any, lane_values: Any) -> Any:
     """Write SUM, X and Y, (0, 0) where the sum is not positive; return 1 / SUM, or 1."""
     width = width_of(lanes)
     zero, one = splat(lanes, 0.0), splat(lanes, 1.0)
@@ -317,7 +318,7 @@ def _store_centre(lanes: Any, total: Any, moment_x: Any, moment_y: Any, lane_val
 
 
 @compiled
-def centre_of_gravity(lanes: Any, image: Any, ny: Any, nx: Any, lane_values: Any) -> None:
+def centre_of_gravity(lanes: Lanes, image: Any, ny: int, nx: int, lane_values: Any) -> None:
     """Write the flux after THRESHOLD and SUBTRACT in each lane, and its centre of gravity.
 
     (0, 0) where the sum is not positive.
@@ -340,7 +341,7 @@ def centre_of_gravity(lanes: Any, image: Any, ny: Any, nx: Any, lane_values: Any
 
 @compiled
 def centre_and_error(
-    lanes: Any, measured: Any, variances: Any, place: Any, image: Any, ny: Any, nx: Any, lane_values: Any
+    lanes: Lanes, measured: Any, variances: Any, place: Any, image: Any, ny: int, nx: int, lane_values: Any
 ) -> None:
     """Write the centre of gravity and its errors: the propagated noise of the remaining pixels.
 
@@ -390,7 +391,14 @@ def centre_and_error(
 
 @compiled
 def _store_error(
-    lanes: Any, noise: Any, first: Any, second: Any, inverse: Any, position: Any, error: Any, lane_values: Any
+    lanes: Lanes,
+    noise: Any,
+    first: Any,
+    second: Any,
+    inverse: Any,
+    position: Any,
+    error: Any,
+    lane_values: Any,
 ) -> None:
     """Write a standard error, from the noise's moments about the window's middle."""
     width = width_of(lanes)
@@ -404,13 +412,13 @@ def _store_error(
 
 @compiled
 def errors_of_smoothed(
-    lanes: Any,
+    lanes: Lanes,
     measured: Any,
     variances: Any,
     place: Any,
     image: Any,
-    ny: Any,
-    nx: Any,
+    ny: int,
+    nx: int,
     smoothing: Any,
     lane_values: Any,
 ) -> None:

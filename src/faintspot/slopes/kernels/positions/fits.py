@@ -17,6 +17,8 @@ from faintspot.slopes.kernels.groups import (
     TOO_MANY_BAD_PIXELS,
     VARIANCE,
     ZERO_X,
+    Group,
+    Scratch,
     driver_of,
 )
 from faintspot.slopes.kernels.host import aligned_zeros
@@ -121,7 +123,7 @@ def spot_scratch(
 
 
 @compiled
-def locate_weighted(group: Any, tables: Any, scratch: Any, stages: Any) -> None:
+def locate_weighted(group: Group, tables: Any, scratch: Scratch, stages: Any) -> None:
     """Follow the spots of a group with a weight."""
     own = scratch.own
     _begin(group, scratch)
@@ -131,7 +133,7 @@ def locate_weighted(group: Any, tables: Any, scratch: Any, stages: Any) -> None:
 
 
 @compiled
-def locate_fitted(group: Any, tables: Any, scratch: Any, stages: Any) -> None:
+def locate_fitted(group: Group, tables: Any, scratch: Scratch, stages: Any) -> None:
     """Fit position and flux of the spots of a group."""
     _round(group, tables.round_electrons, scratch.image)
     _begin(group, scratch)
@@ -144,7 +146,7 @@ def locate_fitted(group: Any, tables: Any, scratch: Any, stages: Any) -> None:
 
 
 @compiled
-def locate_posterior(group: Any, tables: Any, scratch: Any, stages: Any) -> None:
+def locate_posterior(group: Group, tables: Any, scratch: Scratch, stages: Any) -> None:
     """Fit the spots of a group from the posterior's mean, which stays where the posterior is broad."""
     own = scratch.own
     lanes, pixels = group.lanes, group.ny * group.nx
@@ -172,7 +174,7 @@ def locate_posterior(group: Any, tables: Any, scratch: Any, stages: Any) -> None
 
 
 @compiled
-def _round(group: Any, round_electrons: Any, image: Any) -> None:
+def _round(group: Group, round_electrons: Any, image: Any) -> None:
     """Round pixels of low noise to whole electrons, where that is asked for."""
     lanes, pixels = group.lanes, group.ny * group.nx
     width, place = width_of(lanes), group.first * pixels
@@ -185,7 +187,7 @@ def _round(group: Any, round_electrons: Any, image: Any) -> None:
 
 
 @compiled
-def _begin(group: Any, scratch: Any) -> None:
+def _begin(group: Group, scratch: Scratch) -> None:
     """Copy the settings of the lanes' sub-apertures; the initial position is the predicted one."""
     width, first, settings, own = width_of(group.lanes), group.first, group.settings, scratch.own
     lane_values = own.lane_values
@@ -218,7 +220,7 @@ def _begin(group: Any, scratch: Any) -> None:
 
 
 @compiled
-def _begin_at_peak(group: Any, taps: Any, scratch: Any) -> None:
+def _begin_at_peak(group: Group, taps: Any, scratch: Scratch) -> None:
     """Start from the peak of the smoothed image."""
     lanes, own = group.lanes, scratch.own
     gather_taps(width_of(lanes), group.first, taps, own.taps)
@@ -231,7 +233,7 @@ def _begin_at_peak(group: Any, taps: Any, scratch: Any) -> None:
 
 
 @compiled
-def _fit(group: Any, tables: Any, scratch: Any) -> None:
+def _fit(group: Group, tables: Any, scratch: Scratch) -> None:
     """Fit from the current positions; the floor of the weights is a fraction of the flux found so far."""
     width, first, settings, own = width_of(group.lanes), group.first, group.settings, scratch.own
     lane_values = own.lane_values
@@ -247,7 +249,7 @@ def _fit(group: Any, tables: Any, scratch: Any) -> None:
 
 
 @compiled
-def _expect_flux(group: Any, lane_values: Any) -> None:
+def _expect_flux(group: Group, lane_values: Any) -> None:
     """Use the expected flux as the flux."""
     width, first, settings = width_of(group.lanes), group.first, group.settings
     for lane in range(width):
@@ -256,7 +258,7 @@ def _expect_flux(group: Any, lane_values: Any) -> None:
 
 
 @compiled
-def _begin_at_mean_or_peak(width: Any, lane_values: Any) -> None:
+def _begin_at_mean_or_peak(width: int, lane_values: Any) -> None:
     """Begin at the posterior's mean, or at the peak where the grid is too coarse for a narrow posterior.
 
     The likelihood of a PSF that is slightly wrong has several maxima in high flux. The peak beside the
@@ -279,7 +281,7 @@ def _begin_at_mean_or_peak(width: Any, lane_values: Any) -> None:
 
 
 @compiled
-def _keep_broad_posteriors(width: Any, lane_values: Any) -> None:
+def _keep_broad_posteriors(width: int, lane_values: Any) -> None:
     """Along an axis on which the posterior is broader than its grid, its mean and spread are the result.
 
     If it is the only one, x and y stay as correlated as in the fit.
@@ -303,7 +305,7 @@ def _keep_broad_posteriors(width: Any, lane_values: Any) -> None:
 
 
 @compiled
-def _is_illuminated(width: Any, lane: Any, expected: Any, lane_values: Any) -> Any:
+def _is_illuminated(width: int, lane: int, expected: Any, lane_values: Any) -> Any:
     """Return whether there is a spot: its expected flux is not clearly missing, or it is significant."""
     seen = lane_values[spot_rows.SEEN * width + lane]
     error = lane_values[spot_rows.SEEN_ERROR * width + lane]
@@ -313,7 +315,7 @@ def _is_illuminated(width: Any, lane: Any, expected: Any, lane_values: Any) -> A
 
 
 @compiled
-def _is_moving(width: Any, lane: Any, error: Any, lane_values: Any) -> Any:
+def _is_moving(width: int, lane: int, error: Any, lane_values: Any) -> Any:
     """Return whether further steps, as a geometric series, would move a lane by several standard errors."""
     move = lane_values[spot_rows.MOVE * width + lane]
     before = lane_values[spot_rows.MOVE_BEFORE * width + lane]
@@ -321,7 +323,7 @@ def _is_moving(width: Any, lane: Any, error: Any, lane_values: Any) -> Any:
 
 
 @compiled
-def _finish(group: Any, steps: Any, expects_flux: Any, scratch: Any) -> None:
+def _finish(group: Group, steps: Any, expects_flux: Any, scratch: Scratch) -> None:
     """Write the results and the flags of the lanes."""
     width, settings, lane_values, found = (
         width_of(group.lanes),

@@ -17,6 +17,8 @@ from faintspot.slopes.kernels.groups import (
     RESULT_ROWS,
     TOO_MANY_BAD_PIXELS,
     VARIANCE,
+    Group,
+    Scratch,
     driver_of,
 )
 from faintspot.slopes.kernels.host import aligned_zeros
@@ -80,7 +82,7 @@ def gravity_scratch(lanes: Lanes, ny: int, nx: int) -> GravityScratch:
 
 
 @compiled
-def locate_gravity(group: Any, tables: Any, scratch: Any, stages: Any) -> None:
+def locate_gravity(group: Group, tables: GravityTables, scratch: Scratch, stages: Any) -> None:
     """Find the centres of gravity of a group; an estimator's own kernel of `groups.measure_groups`."""
     lanes, ny, nx, first, settings = group.lanes, group.ny, group.nx, group.first, group.settings
     width, own = width_of(lanes), scratch.own
@@ -105,7 +107,7 @@ def locate_gravity(group: Any, tables: Any, scratch: Any, stages: Any) -> None:
 
 @compiled
 def _first_step(
-    flat_start: Any, algorithm: Any, taps: Any, group: Any, image: Any, output: Any, own: Any
+    flat_start: Any, algorithm: Any, taps: Any, group: Group, image: Any, output: Any, own: Any
 ) -> Any:
     """Denoise or smooth the images where there are tables for it; return where the result is."""
     lanes, ny, nx = group.lanes, group.ny, group.nx
@@ -121,7 +123,7 @@ def _first_step(
 
 
 @compiled
-def _locate_with_error(taps: Any, group: Any, image: Any, denoised: Any, own: Any) -> None:
+def _locate_with_error(taps: Any, group: Group, image: Any, denoised: Any, own: Any) -> None:
     """Write the centre of gravity of a denoised image, and its errors."""
     lanes, ny, nx = group.lanes, group.ny, group.nx
     variances, place = group.variances, group.first * ny * nx
@@ -132,7 +134,7 @@ def _locate_with_error(taps: Any, group: Any, image: Any, denoised: Any, own: An
 
 
 @compiled
-def _read_settings(width: Any, first: Any, settings: Any, denoiser: Any, counts: Any, centroid: Any) -> None:
+def _read_settings(width: int, first: int, settings: Any, denoiser: Any, counts: Any, centroid: Any) -> None:
     """Copy the settings of the lanes' sub-apertures."""
     for lane in range(width):
         s = min(first + lane, settings.shape[1] - 1)
@@ -151,7 +153,7 @@ def _read_settings(width: Any, first: Any, settings: Any, denoiser: Any, counts:
 
 
 @compiled
-def _set_threshold(lanes: Any, image: Any, pixels: Any, centroid: Any) -> None:
+def _set_threshold(lanes: Lanes, image: Any, pixels: Any, centroid: Any) -> None:
     """Find THRESHOLD and LARGEST; without a RANK, THRESHOLD is given."""
     if centroid[brightest.RANK * width_of(lanes)] > 0.0:
         _find_threshold(lanes, image, pixels, centroid)
@@ -161,7 +163,7 @@ def _set_threshold(lanes: Any, image: Any, pixels: Any, centroid: Any) -> None:
 
 @compiled
 def _flag_lane(
-    width: Any, lane: Any, ny: Any, nx: Any, first: Any, settings: Any, own: Any, scratch: Any
+    width: int, lane: int, ny: int, nx: int, first: int, settings: Any, own: Any, scratch: Scratch
 ) -> None:
     """Write the bits of one lane's flags, and its iterations."""
     s = min(first + lane, settings.shape[1] - 1)
@@ -187,16 +189,16 @@ gravity_of_groups = driver_of(locate_gravity)
 
 @compiled
 def denoise_stack(
-    lanes: Any,
+    lanes: Lanes,
     images: Any,
     window: Any,
     settings: Any,
     algorithm: Any,
     lowers: Any,
     table: Any,
-    start: Any,
-    stop: Any,
-    scratch: Any,
+    start: int,
+    stop: int,
+    scratch: Scratch,
     found: Any,
 ) -> None:
     """Denoise the groups [start, stop) of a stack of images (n, pixels) of a window (ny, nx).
@@ -229,7 +231,7 @@ def denoise_stack(
 
 @compiled
 def subtract_stack(
-    lanes: Any, images: Any, rank: Any, subtract: Any, start: Any, stop: Any, scratch: Any, result: Any
+    lanes: Lanes, images: Any, rank: Any, subtract: Any, start: int, stop: int, scratch: Scratch, result: Any
 ) -> None:
     """Brightest-pixel background subtraction of the groups [start, stop) of a stack (n, pixels)."""
     width = width_of(lanes)
@@ -248,7 +250,7 @@ def subtract_stack(
 
 @compiled
 def centroid_stack(
-    lanes: Any, images: Any, ny: Any, nx: Any, start: Any, stop: Any, scratch: Any, positions: Any
+    lanes: Lanes, images: Any, ny: int, nx: int, start: int, stop: int, scratch: Scratch, positions: Any
 ) -> None:
     """Centres of gravity of the groups [start, stop) of a stack (n, pixels), into (n, 2)."""
     width = width_of(lanes)

@@ -4,10 +4,12 @@ import math
 from typing import Any
 
 from faintspot.slopes.kernels.compiling import compiled
+from faintspot.slopes.kernels.groups import Group
 from faintspot.slopes.kernels.positions import spot_rows as row
 from faintspot.slopes.kernels.positions.brightest import SMALLEST_VARIANCE, relative_variance, variance_of
 from faintspot.slopes.kernels.positions.spot_rows import look_up
 from faintspot.slopes.kernels.simd import (
+    Lanes,
     absolute,
     copy_transposed,
     load,
@@ -25,7 +27,7 @@ LEAST_FRACTION = 0.05  # of the flux at the start: less under the weight would o
 
 
 @compiled
-def _move(group: Any, image: Any, floor: Any, own: Any) -> None:
+def _move(group: Group, image: Any, floor: Any, own: Any) -> None:
     """Move every lane by the weighted centre of gravity of its image, seen from where it is."""
     lanes, ny, nx, profiles, lane_values = group.lanes, group.ny, group.nx, own.profiles, own.lane_values
     width, padded = width_of(lanes), profiles.shape[3]
@@ -58,7 +60,7 @@ def _move(group: Any, image: Any, floor: Any, own: Any) -> None:
 
 
 @compiled
-def _store_errors(group: Any, image: Any, floor: Any, own: Any) -> None:
+def _store_errors(group: Group, image: Any, floor: Any, own: Any) -> None:
     """Propagate the pixels' noise, VARIANCE (or `variances`) + EXCESS * g, through the last step."""
     lanes, ny, nx, profiles, lane_values = group.lanes, group.ny, group.nx, own.profiles, own.lane_values
     width, place, padded = width_of(lanes), group.first * ny * nx, profiles.shape[3]
@@ -109,7 +111,7 @@ def _store_errors(group: Any, image: Any, floor: Any, own: Any) -> None:
 
 
 @compiled
-def weigh_group(group: Any, tables: Any, image: Any, own: Any) -> None:
+def weigh_group(group: Group, tables: Any, image: Any, own: Any) -> None:
     """Follow the W spots of a group with a weight; parameters as `likelihood.fit_group`.
 
     The tables hold the weight's profile, 1 at its centre.
@@ -123,7 +125,7 @@ def weigh_group(group: Any, tables: Any, image: Any, own: Any) -> None:
 
 
 @compiled
-def rows_from_lanes(lanes: Any, image: Any, ny: Any, nx: Any, starts: Any, rows: Any) -> None:
+def rows_from_lanes(lanes: Lanes, image: Any, ny: int, nx: int, starts: Any, rows: Any) -> None:
     """Reorder a group's images.
 
     Parameters
@@ -163,7 +165,7 @@ def _share(position: Any, spacing: Any, low: Any, high: Any) -> Any:
 
 
 @compiled
-def _log_likelihood(lanes: Any, rows: Any, lane: Any, tables: Any, table: Any, position: Any) -> Any:
+def _log_likelihood(lanes: Lanes, rows: Any, lane: int, tables: Any, table: Any, position: Any) -> Any:
     """Return the sum of the image times the table of a position."""
     width = width_of(lanes)
     count = rows.shape[0] * rows.shape[1]
@@ -182,7 +184,7 @@ def _log_likelihood(lanes: Any, rows: Any, lane: Any, tables: Any, table: Any, p
 
 
 @compiled
-def posterior_of_group(group: Any, tables: Any, image: Any, own: Any) -> None:
+def posterior_of_group(group: Group, tables: Any, image: Any, own: Any) -> None:
     """Write mean, standard deviation and covariance of the posterior of the W spots of a group.
 
     Parameters

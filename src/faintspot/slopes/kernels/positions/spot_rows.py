@@ -4,8 +4,10 @@ import math
 from typing import Any
 
 from faintspot.slopes.kernels.compiling import compiled, inlined
+from faintspot.slopes.kernels.groups import Group
 from faintspot.slopes.kernels.positions.brightest import smooth_pixel, variance_of, weight_variance_of
 from faintspot.slopes.kernels.simd import (
+    Lanes,
     copy_transposed,
     load,
     maximum,
@@ -47,7 +49,7 @@ LANE_ROWS = 52
 
 
 @inlined
-def model_at(lanes: Any, profiles: Any, x: Any, y: Any) -> Any:
+def model_at(lanes: Lanes, profiles: Any, x: Any, y: Any) -> Any:
     """Return the PSF, a sum of separable terms, and its derivatives along x and y, at one pixel."""
     width, rank, padded = width_of(lanes), profiles.shape[1], profiles.shape[3]
     m = mx = my = splat(lanes, 0.0)
@@ -61,7 +63,7 @@ def model_at(lanes: Any, profiles: Any, x: Any, y: Any) -> Any:
 
 
 @inlined
-def noise_of(lanes: Any, lane_values: Any) -> Any:
+def noise_of(lanes: Lanes, lane_values: Any) -> Any:
     """Return the numbers of the lanes that `weigh` needs."""
     width = width_of(lanes)
     v, e = load(lanes, lane_values, VARIANCE * width), load(lanes, lane_values, EXCESS * width)
@@ -71,7 +73,7 @@ def noise_of(lanes: Any, lane_values: Any) -> Any:
 
 
 @inlined
-def weigh(lanes: Any, noise: Any, variances: Any, at: Any, m: Any) -> Any:
+def weigh(lanes: Lanes, noise: Any, variances: Any, at: Any, m: Any) -> Any:
     """Return the weight w of the pixel at element `at`, of which the model is m, and w times its variance."""
     v, e, wv, we, model_error = noise
     expected = maximum(m, splat(lanes, 0.0))
@@ -84,7 +86,7 @@ _LEAST_LEFT = 1e-5  # of the information on the flux: below it is round-off, and
 
 
 @compiled
-def subtract_background(lanes: Any, image: Any, pixels: Any, flux: Any) -> None:
+def subtract_background(lanes: Lanes, image: Any, pixels: Any, flux: Any) -> None:
     """Subtract from every lane's image the constant that leaves it `flux` (a vector, electrons)."""
     width = width_of(lanes)
     even, odd = splat(lanes, 0.0), splat(lanes, 0.0)  # neither addition waits for the other
@@ -99,7 +101,7 @@ def subtract_background(lanes: Any, image: Any, pixels: Any, flux: Any) -> None:
 
 
 @compiled
-def eliminate_background(group: Any, image: Any, own: Any) -> None:
+def eliminate_background(group: Group, image: Any, own: Any) -> None:
     """Turn the sums of a fit of x, y and the flux into those of a fit that has a constant as well.
 
     Parameters as `likelihood.fit_group`; SCORE_*, I_* and J_* are read and written.
@@ -145,7 +147,7 @@ def eliminate_background(group: Any, image: Any, own: Any) -> None:
 
 
 @compiled
-def _add(lanes: Any, lane_values: Any, row: Any, change: Any) -> None:
+def _add(lanes: Lanes, lane_values: Any, row: Any, change: Any) -> None:
     """Add to a row."""
     at = row * width_of(lanes)
     store(lane_values, at, load(lanes, lane_values, at) + change)
@@ -156,7 +158,7 @@ MARGIN = 2  # px that a table reaches beyond the window's side, on either end
 
 
 @compiled
-def look_up(group: Any, tables: Any, own: Any) -> None:
+def look_up(group: Group, tables: Any, own: Any) -> None:
     """Write every lane's profiles, and their derivatives in the position, at its position X, Y.
 
     Parameters
@@ -205,7 +207,7 @@ LEAST_FLUX_E = 1.0  # an estimate of the flux below this says nothing
 
 
 @compiled
-def _pixel_range(lanes: Any, lane_values: Any, low: Any, high: Any, n: Any) -> Any:
+def _pixel_range(lanes: Lanes, lane_values: Any, low: Any, high: Any, n: Any) -> Any:
     """First and last pixel whose centre is within half a pixel of some lane's allowed positions."""
     width = width_of(lanes)
     first, last = n - 1, 0
@@ -218,7 +220,7 @@ def _pixel_range(lanes: Any, lane_values: Any, low: Any, high: Any, n: Any) -> A
 
 @compiled
 def find_start(
-    lanes: Any, image: Any, ny: Any, nx: Any, reach: Any, taps: Any, smoothed: Any, lane_values: Any
+    lanes: Lanes, image: Any, ny: int, nx: int, reach: Any, taps: Any, smoothed: Any, lane_values: Any
 ) -> None:
     """Write X, Y and FLUX of every lane: its largest smoothed pixel within the allowed positions.
 

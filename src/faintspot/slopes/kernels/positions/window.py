@@ -19,6 +19,10 @@ from faintspot.slopes.kernels.groups import (
     NO_FLUX,
     SATURATED,
     TOO_MANY_BAD_PIXELS,
+    Group,
+    Scratch,
+    SlopeArrays,
+    Source,
     Task,
     driver_of,
     place_of,
@@ -92,7 +96,7 @@ def no_scratch(lanes: Lanes, ny: int, nx: int) -> tuple[Any, ...]:
 
 
 @compiled
-def locate_window(group: Any, tables: Any, scratch: Any, stages: Any) -> None:
+def locate_window(group: Group, tables: Any, scratch: Scratch, stages: Any) -> None:
     """Sum the images of a group under their weights."""
     lanes, nx, image, found = group.lanes, group.nx, scratch.image, scratch.results
     width = width_of(lanes)
@@ -130,7 +134,7 @@ def locate_window(group: Any, tables: Any, scratch: Any, stages: Any) -> None:
 
 
 @compiled
-def _solved(settings: Any, s: Any, sum_x: Any, sum_y: Any, seen: Any) -> Any:
+def _solved(settings: Any, s: int, sum_x: Any, sum_y: Any, seen: Any) -> Any:
     """Return position, flux, standard errors, covariance, and whether they are good for anything."""
     divisor = settings[DIVISOR, s]
     flux = divisor
@@ -155,7 +159,7 @@ window_of_groups = driver_of(locate_window)
 
 
 @compiled
-def _measure(source: Any, tables: Any, f: Any, s: Any, settings: Any, slopes: Any) -> Any:
+def _measure(source: Source, tables: Any, f: int, s: int, settings: Any, slopes: SlopeArrays) -> Any:
     """Measure one sub-aperture; False, and nothing written, where a pixel that counts is bad."""
     if tables.bad[s]:
         return False
@@ -196,7 +200,7 @@ def _measure(source: Any, tables: Any, f: Any, s: Any, settings: Any, slopes: An
 
 @compiled
 def window_in_rows(
-    source: Any, task: Any, start: Any, stop: Any, scratch: Any, slopes: Any, stages: Any
+    source: Source, task: Task, start: int, stop: int, scratch: Any, slopes: SlopeArrays, stages: Any
 ) -> None:
     """Compute the slopes of the groups [start, stop) of a block of frames; see `groups.measure_groups`."""
     width, n = width_of(source.lanes), source.corners.shape[0]

@@ -13,6 +13,7 @@ from typing import Any
 
 from faintspot.slopes.kernels.compiling import compiled
 from faintspot.slopes.kernels.simd import (
+    Lanes,
     load,
     maximum,
     minimum,
@@ -63,7 +64,7 @@ def row_vectors(ny: int, nx: int) -> int:
 
 @compiled
 def _measure_change(
-    lanes: Any, state: Any, rows: Any, ny: Any, nx: Any, current: Any, inverse: Any, lane_values: Any
+    lanes: Lanes, state: Any, rows: Any, ny: int, nx: int, current: Any, inverse: Any, lane_values: Any
 ) -> None:
     """Sum ||div p - div p_then||^2 and ||div p - g / lambda||^2 per lane, both times 4, since the last test.
 
@@ -91,7 +92,7 @@ def _measure_change(
 
 @compiled
 def _write_finished(
-    lanes: Any, state: Any, rows: Any, output: Any, ny: Any, nx: Any, current: Any, lane_values: Any
+    lanes: Lanes, state: Any, rows: Any, output: Any, ny: int, nx: int, current: Any, lane_values: Any
 ) -> None:
     """Write u = g - lambda div p of the lanes that finish now, with lambda such that the constraint holds."""
     width = width_of(lanes)
@@ -119,7 +120,7 @@ def _write_finished(
 
 @compiled
 def _prepare(
-    lanes: Any, image: Any, state: Any, ny: Any, nx: Any, smallest_range: Any, lane_values: Any
+    lanes: Lanes, image: Any, state: Any, ny: int, nx: int, smallest_range: Any, lane_values: Any
 ) -> None:
     """Normalise the images into the state.
 
@@ -154,14 +155,14 @@ def _prepare(
 
 
 @compiled
-def _copy_lane(width: Any, lane: Any, pixels: Any, image: Any, output: Any) -> None:
+def _copy_lane(width: int, lane: int, pixels: Any, image: Any, output: Any) -> None:
     for i in range(lane, pixels * width, width):
         output[i] = image[i]
 
 
 @compiled
 def _decide_beforehand(
-    width: Any,
+    width: int,
     pixels: Any,
     smallest: Any,
     lowers: Any,
@@ -212,7 +213,7 @@ def _decide_beforehand(
 
 
 @compiled
-def _next_limit(width: Any, counts: Any) -> Any:
+def _next_limit(width: int, counts: Any) -> Any:
     """The smallest iteration limit among the active lanes."""
     limit = 1 << 62
     for lane in range(width):
@@ -222,7 +223,7 @@ def _next_limit(width: Any, counts: Any) -> Any:
 
 
 @compiled
-def _mark_finished(width: Any, iteration: Any, tested: Any, lane_values: Any, counts: Any) -> Any:
+def _mark_finished(width: int, iteration: Any, tested: Any, lane_values: Any, counts: Any) -> Any:
     """Mark the active lanes that have converged or reached their limit; return how many."""
     finished = 0
     for lane in range(width):
@@ -244,7 +245,7 @@ def _mark_finished(width: Any, iteration: Any, tested: Any, lane_values: Any, co
 
 @compiled
 def denoise_group(
-    lanes: Any, algorithm: Any, lowers: Any, table: Any, window: Any, image: Any, output: Any, own: Any
+    lanes: Lanes, algorithm: Any, lowers: Any, table: Any, window: Any, image: Any, output: Any, own: Any
 ) -> None:
     """Denoise the W images of a group.
 

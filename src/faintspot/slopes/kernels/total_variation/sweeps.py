@@ -16,6 +16,7 @@ from typing import Any
 
 from faintspot.slopes.kernels.compiling import compiled, inlined, vector_registers
 from faintspot.slopes.kernels.simd import (
+    Lanes,
     align_stack,
     load,
     maximum,
@@ -36,7 +37,7 @@ EXTRAPOLATES_AHEAD = vector_registers() >= 32
 
 
 @inlined
-def _extrapolate(lanes: Any, state: Any, place: Any, current: Any, previous: Any, momentum: Any) -> Any:
+def _extrapolate(lanes: Lanes, state: Any, place: Any, current: Any, previous: Any, momentum: Any) -> Any:
     """Extrapolate: q = p + momentum * (p - p_previous) at one pixel."""
     width = width_of(lanes)
     px = load(lanes, state, place + current)
@@ -47,7 +48,7 @@ def _extrapolate(lanes: Any, state: Any, place: Any, current: Any, previous: Any
 
 
 @inlined
-def _extrapolate_pair(lanes: Any, state: Any, place: Any, line: Any, versions: Any, momentum: Any) -> Any:
+def _extrapolate_pair(lanes: Lanes, state: Any, place: Any, line: Any, versions: Any, momentum: Any) -> Any:
     """Extrapolate one pixel of the upper row and the pixel below it."""
     qx, qy = _extrapolate(lanes, state, place, versions[0], versions[1], momentum)
     rx, ry = _extrapolate(lanes, state, place + line, versions[0], versions[1], momentum)
@@ -55,7 +56,7 @@ def _extrapolate_pair(lanes: Any, state: Any, place: Any, line: Any, versions: A
 
 
 @inlined
-def store_projected(lanes: Any, state: Any, target: Any, px: Any, py: Any) -> None:
+def store_projected(lanes: Lanes, state: Any, target: Any, px: Any, py: Any) -> None:
     """Store the nearest dual vector of length at most two."""
     bounded_square = maximum(multiply_add(px, px, py * py), splat(lanes, 4.0))
     shrink = twice_reciprocal_square_root(bounded_square)
@@ -65,7 +66,7 @@ def store_projected(lanes: Any, state: Any, target: Any, px: Any, py: Any) -> No
 
 @inlined
 def _turn(
-    lanes: Any,
+    lanes: Lanes,
     state: Any,
     rows: Any,
     x: Any,
@@ -125,7 +126,7 @@ def _turn(
 
 
 @inlined
-def _no_work(lanes: Any, norm: Any, place: Any) -> Any:
+def _no_work(lanes: Lanes, norm: Any, place: Any) -> Any:
     """Return the initial `carried`: its first update, of zero at `place`, is overwritten later."""
     zero = splat(lanes, 0.0)
     return norm, zero, (zero, zero, zero, zero), (zero, zero, zero, zero, zero), place
@@ -133,7 +134,7 @@ def _no_work(lanes: Any, norm: Any, place: Any) -> Any:
 
 @inlined
 def _sweep_pair(
-    lanes: Any, state: Any, rows: Any, y: Any, nx: Any, versions: Any, factors: Any, top: Any, carried: Any
+    lanes: Lanes, state: Any, rows: Any, y: Any, nx: int, versions: Any, factors: Any, top: Any, carried: Any
 ) -> Any:
     """All turns of rows y and y + 1, `top` when y = 0; `rows`: those of row y - 1, then of row y + 1."""
     width = width_of(lanes)
@@ -157,7 +158,7 @@ def _sweep_pair(
 
 
 @inlined
-def _finish(lanes: Any, state: Any, previous: Any, carried: Any) -> Any:
+def _finish(lanes: Lanes, state: Any, previous: Any, carried: Any) -> Any:
     """Update p in the rightmost pixel of the last pair's upper row; return the norm."""
     norm, _, _, (ax, ay, av, _, bv), behind = carried
     store_projected(lanes, state, behind + previous, ax, (bv - av) + ay)
@@ -165,7 +166,7 @@ def _finish(lanes: Any, state: Any, previous: Any, carried: Any) -> Any:
 
 
 @inlined
-def _first_row(lanes: Any, state: Any, rows: Any, nx: Any, versions: Any, factors: Any) -> Any:
+def _first_row(lanes: Lanes, state: Any, rows: Any, nx: int, versions: Any, factors: Any) -> Any:
     """Put the first row into `rows`; return the norm."""
     width = width_of(lanes)
     momentum, minus_inverse, step = factors
@@ -185,7 +186,7 @@ def _first_row(lanes: Any, state: Any, rows: Any, nx: Any, versions: Any, factor
 
 
 @inlined
-def _update_last_row(lanes: Any, state: Any, rows: Any, target: Any, nx: Any) -> None:
+def _update_last_row(lanes: Lanes, state: Any, rows: Any, target: Any, nx: int) -> None:
     """Update p of the row in `rows`, the image's last: no gradient across the lower edge, py stays zero."""
     width = width_of(lanes)
     zero, v = splat(lanes, 0.0), load(lanes, rows, 2 * width)
@@ -199,7 +200,7 @@ def _update_last_row(lanes: Any, state: Any, rows: Any, target: Any, nx: Any) ->
 
 @compiled
 def sweep_fgp(
-    lanes: Any, state: Any, rows: Any, ny: Any, nx: Any, current: Any, momentum: Any, inverse: Any
+    lanes: Lanes, state: Any, rows: Any, ny: int, nx: int, current: Any, momentum: Any, inverse: Any
 ) -> Any:
     """Make one accelerated projected-gradient iteration on each pixel; return ||div q||^2 per lane.
 
@@ -231,7 +232,7 @@ def sweep_fgp(
 
 
 @compiled
-def sweep_chambolle(lanes: Any, state: Any, rows: Any, ny: Any, nx: Any, current: Any, inverse: Any) -> Any:
+def sweep_chambolle(lanes: Lanes, state: Any, rows: Any, ny: int, nx: int, current: Any, inverse: Any) -> Any:
     """Make one "chambolle" iteration on each pixel; return ||div p||^2 per lane, of the new p.
 
     With the norm of the previous p, one iteration late, the multiplier would oscillate near
@@ -271,7 +272,7 @@ def sweep_chambolle(lanes: Any, state: Any, rows: Any, ny: Any, nx: Any, current
 
 @compiled
 def twice_divergence(
-    lanes: Any, state: Any, place: Any, version: Any, y: Any, x: Any, line: Any, pixel: Any
+    lanes: Lanes, state: Any, place: Any, version: Any, y: Any, x: Any, line: Any, pixel: Any
 ) -> Any:
     """2 div p at one pixel, of the version of p that starts `version` elements after the pixel."""
     width = width_of(lanes)

@@ -12,7 +12,8 @@ import numpy as np
 from faintspot.base.checks import LARGEST_FLOAT32
 from faintspot.base.flags import UNMEASURED, SubapertureFlag
 from faintspot.slopes.kernels.compiling import compiled, inlined
-from faintspot.slopes.kernels.gather import pixels_of
+from faintspot.slopes.kernels.gather import Frames, pixels_of
+from faintspot.slopes.kernels.groups import SlopeArrays
 from faintspot.slopes.kernels.simd import (
     absolute,
     get,
@@ -70,7 +71,7 @@ class LightTest(NamedTuple):
 
 
 @compiled
-def flag_dark(test: Any, frames: Any, slopes: Any, scratch: Any) -> None:
+def flag_dark(test: LightTest, frames: Frames, slopes: SlopeArrays, scratch: Any) -> None:
     """Flag dark sub-apertures NO_FLUX: known ones, and those that bright frames show; slopes become 0.
 
     A frame is bright if its typical spots are so significant that a much fainter one would be seen.
@@ -147,7 +148,7 @@ def _typical_flux(flux: Any, flags: Any, scratch: Any) -> Any:
 
 
 @compiled
-def _is_bright(test: Any, frames: Any, f: Any, noise: Any, scratch: Any) -> Any:
+def _is_bright(test: LightTest, frames: Frames, f: int, noise: Any, scratch: Any) -> Any:
     """Return whether most of the typical spots, whose numbers begin `scratch`, are bright."""
     bright = total = 0
     for i in range(GAUGES):
@@ -159,7 +160,7 @@ def _is_bright(test: Any, frames: Any, f: Any, noise: Any, scratch: Any) -> Any:
 
 
 @compiled
-def _make_dark(f: Any, s: Any, slopes: Any) -> None:
+def _make_dark(f: int, s: int, slopes: SlopeArrays) -> None:
     """Flag a sub-aperture NO_FLUX, with the results of an unmeasured one, unless it is one."""
     if slopes.flags[f, s] & _UNMEASURED:
         return
@@ -169,7 +170,7 @@ def _make_dark(f: Any, s: Any, slopes: Any) -> None:
 
 
 @compiled
-def significances(test: Any, frames: Any, found: Any, scratch: Any) -> None:
+def significances(test: LightTest, frames: Frames, found: Any, scratch: Any) -> None:
     """Write the significance of the flux of each window of a frame (1, h, w), infinite without noise: (n,).
 
     `scratch` has `scratch_size` numbers or more.
@@ -181,7 +182,7 @@ def significances(test: Any, frames: Any, found: Any, scratch: Any) -> None:
 
 
 @compiled
-def add_windows(test: Any, frames: Any, start: Any, stop: Any, weight: Any, mean: Any) -> None:
+def add_windows(test: LightTest, frames: Frames, start: int, stop: int, weight: Any, mean: Any) -> None:
     """Add windows [start, stop) of a frame (1, h, w) to their running means, (n * ny, nx) float32 [ADU].
 
     Parameters
@@ -205,7 +206,7 @@ def add_windows(test: Any, frames: Any, start: Any, stop: Any, weight: Any, mean
 
 
 @compiled
-def frame_noise(test: Any, frames: Any, f: Any, windows: Any, flags: Any, scratch: Any) -> Any:
+def frame_noise(test: LightTest, frames: Frames, f: int, windows: Any, flags: Any, scratch: Any) -> Any:
     """Return the noise of a pixel, from differences of pixels along the borders of some windows.
 
     It is the median over windows, evenly spread, of which each has the mean absolute difference of its first
@@ -232,7 +233,7 @@ def frame_noise(test: Any, frames: Any, f: Any, windows: Any, flags: Any, scratc
 
 
 @compiled
-def _border_difference(test: Any, frames: Any, f: Any, s: Any) -> Any:
+def _border_difference(test: LightTest, frames: Frames, f: int, s: int) -> Any:
     """Return the mean absolute difference of a window's two first and two last rows; -1 without any."""
     lanes, row, column = test.lanes, test.corners[s, 0], test.corners[s, 1]
     width, (ny, nx) = width_of(lanes), test.window
@@ -254,7 +255,7 @@ def _border_difference(test: Any, frames: Any, f: Any, s: Any) -> Any:
 
 
 @inlined
-def _calibrated(test: Any, frames: Any, f: Any, y: Any, x: Any) -> Any:
+def _calibrated(test: LightTest, frames: Frames, f: int, y: Any, x: Any) -> Any:
     """Return the calibrated pixels of a row of a frame from x on; NaN or infinite if bad."""
     height, line = frames.counts.shape[1:]
     at = y * line + x
@@ -264,7 +265,7 @@ def _calibrated(test: Any, frames: Any, f: Any, y: Any, x: Any) -> Any:
 
 
 @compiled
-def peak_above_border(test: Any, frames: Any, f: Any, s: Any, scratch: Any) -> Any:
+def peak_above_border(test: LightTest, frames: Frames, f: int, s: int, scratch: Any) -> Any:
     """Return the largest sum of a window's pixels in a box, above the median of its four sides' means.
 
     Bad pixels count as the background; infinite without a good pixel on every side. `scratch` is used behind
@@ -308,7 +309,7 @@ def peak_above_border(test: Any, frames: Any, f: Any, s: Any, scratch: Any) -> A
 
 
 @compiled
-def _border_level(ny: Any, nx: Any, image: Any, at: Any) -> Any:
+def _border_level(ny: int, nx: int, image: Any, at: Any) -> Any:
     """Return the median of the means of the four sides of an image; NaN if one has no good pixel."""
     top, bottom = _side_mean(image, at, 1, nx), _side_mean(image, at + (ny - 1) * nx, 1, nx)
     left, right = _side_mean(image, at, nx, ny), _side_mean(image, at + nx - 1, nx, ny)

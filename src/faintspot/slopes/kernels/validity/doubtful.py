@@ -7,8 +7,10 @@ import numpy as np
 
 from faintspot.base.flags import INVALID, UNMEASURED, SubapertureFlag
 from faintspot.slopes.kernels.compiling import compiled
+from faintspot.slopes.kernels.groups import SlopeArrays
 from faintspot.slopes.kernels.host import WIDTHS
 from faintspot.slopes.kernels.simd import (
+    Lanes,
     any_lane,
     gathered,
     load,
@@ -19,7 +21,7 @@ from faintspot.slopes.kernels.simd import (
     store,
     width_of,
 )
-from faintspot.slopes.kernels.validity.dark import flag_dark
+from faintspot.slopes.kernels.validity.dark import LightTest, flag_dark
 
 _UNMEASURED, _INVALID = int(UNMEASURED), int(INVALID)
 UNLIKE_NEIGHBOURS = int(SubapertureFlag.UNLIKE_NEIGHBOURS)
@@ -64,14 +66,14 @@ def doubtful_scratch_size(n: int) -> int:
 
 
 @compiled
-def check_slopes(test: Any, frames: Any, slopes: Any, expected: Any, scratch: Any) -> None:
+def check_slopes(test: LightTest, frames: Any, slopes: SlopeArrays, expected: Expected, scratch: Any) -> None:
     """Flag dark sub-apertures and doubtful spots of frames; see `flag_dark` and `flag_doubtful`."""
     flag_dark(test, frames, slopes, scratch)
     flag_doubtful(slopes.x, slopes.y, slopes.flux, slopes.flags, expected, scratch)
 
 
 @compiled
-def flag_doubtful(x: Any, y: Any, flux: Any, flags: Any, expected: Any, scratch: Any) -> None:
+def flag_doubtful(x: Any, y: Any, flux: Any, flags: Any, expected: Expected, scratch: Any) -> None:
     """Add AT_SEARCH_LIMIT and UNLIKE_NEIGHBOURS to the flags of measured slopes, each (n_frames, n).
 
     Displacements that change evenly from one neighbour to the next are alike. `scratch` has at least
@@ -95,7 +97,7 @@ def flag_doubtful(x: Any, y: Any, flux: Any, flags: Any, expected: Any, scratch:
 
 
 @compiled
-def _away(lanes: Any, first: Any, at: Any, expected: Any, enough: Any) -> Any:
+def _away(lanes: Lanes, first: int, at: Any, expected: Expected, enough: Any) -> Any:
     """Return the squared differences of W slopes from the most similar of their lines; infinite without one.
 
     The first ones are divided by their variance for slopes of error 1, the second ones are in px^2. Lines are
@@ -124,7 +126,7 @@ def _away(lanes: Any, first: Any, at: Any, expected: Any, enough: Any) -> Any:
 
 
 @compiled
-def _is_any_suspect(at: Any, expected: Any) -> Any:
+def _is_any_suspect(at: Any, expected: Expected) -> Any:
     """Return whether a slope may differ from each of its lines by more than the difference that counts."""
     lanes, width = expected.lanes, width_of(expected.lanes)
     like = splat(lanes, np.float32(0.99) * expected.least * expected.least)
@@ -137,7 +139,9 @@ def _is_any_suspect(at: Any, expected: Any) -> Any:
 
 
 @compiled
-def _compare(f: Any, x: Any, y: Any, flux: Any, flags: Any, expected: Any, at: Any, scratch: Any) -> None:
+def _compare(
+    f: int, x: Any, y: Any, flux: Any, flags: Any, expected: Expected, at: Any, scratch: Any
+) -> None:
     """Compare the slopes of a frame with their lines, and flag those unlike all their neighbours."""
     lanes, width = expected.lanes, width_of(expected.lanes)
     n, padded, largest, other_flux = x.shape[1], expected.far.shape[1], np.float32(0.0), 0
@@ -161,7 +165,7 @@ def _compare(f: Any, x: Any, y: Any, flux: Any, flags: Any, expected: Any, at: A
 
 @compiled
 def _flag_unlike(
-    f: Any, x: Any, y: Any, flux: Any, flags: Any, expected: Any, differences: Any, least_px: Any
+    f: int, x: Any, y: Any, flux: Any, flags: Any, expected: Expected, differences: Any, least_px: Any
 ) -> None:
     """Add UNLIKE_NEIGHBOURS to the flags of a frame; take it from spots whose neighbours were wrong."""
     n = x.shape[1]
@@ -182,7 +186,7 @@ def _flag_unlike(
 
 
 @compiled
-def _has_other_flux(f: Any, s: Any, flux: Any, flags: Any, expected: Any) -> Any:
+def _has_other_flux(f: int, s: int, flux: Any, flags: Any, expected: Expected) -> Any:
     """Return whether a window has clearly more flux than all its neighbours, or a fraction of it.
 
     A second spot or a ghost causes that. Windows with saturated pixels never count.
@@ -209,7 +213,7 @@ def _has_other_flux(f: Any, s: Any, flux: Any, flags: Any, expected: Any) -> Any
 
 
 @compiled
-def _is_continued(f: Any, s: Any, x: Any, y: Any, flags: Any, expected: Any, limit: Any) -> Any:
+def _is_continued(f: int, s: int, x: Any, y: Any, flags: Any, expected: Expected, limit: Any) -> Any:
     """Return whether a slope continues at least half of the lines of two valid ones beside it."""
     agree = total = 0
     for k in range(expected.behind.shape[1]):
