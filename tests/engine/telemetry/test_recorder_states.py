@@ -290,4 +290,4 @@ def test_recordings_are_what_the_engine_wrote(monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.setattr(zarr.Array, "resize", lambda array, shape: disk.resize(array, shape))
     monkeypatch.setattr(recorder, "_POLL_S", 0.0)
     monkeypatch.setattr(recorder, "_FLUSH_S", 1e9)
-    try_states(type("OnDisk", (Recordings,), {"disk": disk}), 3, 20)
+    try_states(type("OnDisk", (Recordings,), {"disk": disk}), 6, 20)
