@@ -80,7 +80,7 @@ class CacheWarning(RuntimeWarning):
 
 
 class DoubtWarning(UserWarning):
-    """A layout is used about which `faintspot layout` had doubts that nobody has settled."""
+    """A layout is doubtful, and nobody has settled it."""
 
 
 EXTRAS = {

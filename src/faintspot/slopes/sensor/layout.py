@@ -339,7 +339,8 @@ class Layout(ConfigurationTable, table="layout"):
         Layout
             Illuminated sub-apertures whose windows are within the frame. Windows are centred on the lattice
             of the spots, unless shifted, or following spots moved by over a quarter of the pitch; `centres`
-            contain the lattice. `faintspot.slopes.sensor.found_layout.find_layout` lists the spots left out.
+            contain the lattice. A doubt about it is in `doubts`, and a `DoubtWarning`.
+            `faintspot.slopes.sensor.found_layout.find_layout` lists the spots left out, and doubtful ones.
 
         Raises
         ------
@@ -356,7 +357,11 @@ class Layout(ConfigurationTable, table="layout"):
             bad_pixels=bad_pixels,
             **options,
         )
-        return cls.of_windows(found)
+        layout, doubt = cls.of_windows(found), found.lenslets.doubt
+        if not doubt:
+            return layout
+        warnings.warn(f"doubtful layout: {doubt} (look at layout.plot(frame))", DoubtWarning, stacklevel=2)
+        return replace(layout, doubts=(doubt,))
 
     @classmethod
     def of_windows(cls, found: Windows) -> Layout:

@@ -8,8 +8,9 @@ from numpy.typing import NDArray
 from tests.patience import mostly_slow
 from tests.slopes.sensor.sensor_cases import spot_frame
 
-from faintspot.base.errors import InputError
+from faintspot.base.errors import DoubtWarning, InputError
 from faintspot.slopes.sensor.detection.lenslets import find_lenslets
+from faintspot.slopes.sensor.layout import Layout
 
 PLAIN = plain_small()
 
@@ -39,7 +40,11 @@ def test_spots_between_the_lenslets_make_a_lattice_doubtful(part: float) -> None
     at = nodes(12, 20.0) + 150 * (1 + 1j)
     between = at[rng.random(len(at)) < part] + 10 * (1 + 1j) * np.exp(1j * np.radians(4.0))
     frame = spot_frame(np.concatenate([at, between]), (300, 300), flux_e=4000.0, width_px=1.4)
-    assert "only a part of the flux" in find_lenslets(frame).doubt
+    doubt = find_lenslets(frame).doubt
+    assert "only a part of the flux" in doubt
+    with pytest.warns(DoubtWarning):
+        layout = Layout.from_frame(frame)
+    assert layout.doubts == (doubt,)
 
 
 @pytest.mark.parametrize("seed", mostly_slow(1, range(4)))
