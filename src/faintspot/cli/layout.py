@@ -40,6 +40,7 @@ from faintspot.slopes.recorded.first_layout import (
     stated_optics,
 )
 from faintspot.slopes.recorded.first_settings import FirstSettings
+from faintspot.slopes.sensor.detection.fits import MOST
 from faintspot.slopes.sensor.found_layout import FoundLayout
 from faintspot.slopes.sensor.layout import GEOMETRIES, LARGEST_BIN, OPTICS, Layout
 from faintspot.slopes.sensor.window_checks import LARGEST_WINDOW, removed_terms
@@ -77,7 +78,7 @@ _LARGE_PX = 0.03  # constant error at the pupil's edge
     "--grid",
     metavar="ROWSxCOLUMNS",
     help="Rows and columns of an array that fills the frame or --roi, such as quad cells; then only which "
-    "lenslets are illuminated is searched for.",
+    "lenslets are illuminated is searched for. Up to 4x4 spots may be anywhere.",
 )
 @_array(
     "--roi",
@@ -174,7 +175,8 @@ def command(
     FRAME is a file with spots, from one frame to many of the same field (the first 200 are averaged). Square
     and hexagonal lenslet arrays are found without hints: pitch, angle, offset, and which lenslets are
     illuminated.
-    Spots of quad cells (2 x 2 pixels) overlap and cannot be found; --grid gives the array. A picture shows
+    Spots of quad cells (2 x 2 pixels) overlap and cannot be found; --grid gives the array, and settles
+    doubts about sensors of few spots. A picture shows
     the frame with the windows that were found: look at it. --illuminated-fraction, --pupil, --exclude correct
     it.
 
@@ -190,6 +192,7 @@ def command(
       faintspot layout cube.npz --dark dark.fits --gain-e-per-adu 1.9 --pixels 16
       faintspot layout eye.fits --pupil 512,498,320,40 --exclude 0-3,57
       faintspot layout large_windows.tif --bin 2
+      faintspot layout tip_tilt.fits --grid 2x2
       faintspot layout quad_cells.fits --grid 40x40 --dark dark.fits
     """
     target = Path(output)
@@ -253,6 +256,8 @@ def _options_of_grid(text: str, options: Mapping[str, Any]) -> dict[str, Any]:
     rows, _, columns = text.lower().partition("x")
     if not (rows.isdecimal() and columns.isdecimal() and int(rows) * int(columns) > 0):
         raise InputError(f"--grid {text}: expected rows and columns of lenslets, such as 7x7")
+    if max(int(rows), int(columns)) <= MOST:
+        return {**options, "grid": (int(rows), int(columns))}
     wrong = [flag_of(name) for name in _ONLY_WITHOUT if options[name] not in (None, False, "auto", ())]
     if wrong:
         raise InputError(f"--grid, {', '.join(wrong)}: expected one of them; a grid fills the frame or --roi")
@@ -289,7 +294,7 @@ def describe(first: FirstLayout, settings: Settings) -> list[str]:
         )
     lines += [f"doubtful: {doubt}" for doubt in layout.doubts]
     if found.doubts:
-        lines.append("(see the picture; try --pitch-px, --pupil)")
+        lines.append("(see the picture; try --pitch-px, --grid, --pupil)")
     if isinstance(found, FoundLayout):
         lines += _left_out(found, layout)
     elif is_quad_cell(layout):

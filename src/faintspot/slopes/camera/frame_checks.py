@@ -14,8 +14,10 @@ from faintspot.base.statistics import MAD_TO_STD
 # 0.9 px have a contrast of 1.16 where all lie at the same place of their pixel.
 _NARROWEST_PX = 1.1
 _CONTRAST = 1.25  # of the gains, from which slopes suffer
+_NO_FILTER = 100.0  # pixels without any flux are gaps
 _AGREE = 0.9  # part of the spots that show the same order of the gains
 _FEWEST = 4  # spots
+_SIGNIFICANT = 5.0  # standard errors by which the gains of many spots differ
 _SMOOTHING = np.outer([1, 2, 1], [1, 2, 1]) / 16  # weighs even and odd rows and columns alike
 
 
@@ -61,9 +63,12 @@ def mosaic_contrast(
         ]
     )
     gain = np.median(gains, axis=1)
-    agree = float(np.mean(gains[gain.argmax()] > gains[gain.argmin()]))
+    above = gains[gain.argmax()] - gains[gain.argmin()]
+    if above.mean() < _SIGNIFICANT * (1 + 8 / len(rows)) * above.std() / np.sqrt(len(rows)):
+        return 1.0
+    agree = float(np.mean(above > 0))
     contrast = float(gain.max() / max(gain.min(), 1e-3))
-    return contrast if agree > _AGREE and contrast > _CONTRAST else 1.0
+    return contrast if agree > _AGREE and _CONTRAST < contrast < _NO_FILTER else 1.0
 
 
 _FEWEST_PIXELS, _FEWEST_VALUES = 4, 8  # clipped pixels of the frame, and values over all frames

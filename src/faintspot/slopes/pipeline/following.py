@@ -20,7 +20,7 @@ from faintspot.slopes.pipeline.slope_pipeline import SlopePipeline
 from faintspot.slopes.pipeline.slopes import Slopes
 from faintspot.slopes.sensor.detection.acquisition import Acquired, FollowedDrift, acquire
 from faintspot.slopes.sensor.detection.candidates import Lattice
-from faintspot.slopes.sensor.detection.nodes import find_spots, spot_width
+from faintspot.slopes.sensor.detection.nodes import SpotImage, find_spots, spot_width
 from faintspot.slopes.sensor.layout import Layout
 from faintspot.slopes.sensor.region import as_rows, neighbours_of
 from faintspot.slopes.spots.fixed_weights import FixedWeights
@@ -212,7 +212,7 @@ class SpotFollower:
         good = np.isfinite(calibrated)
         if not good.any() or np.ptp(calibrated[good]) == 0:
             return None
-        image = np.where(good, calibrated, np.median(calibrated[good])).astype(np.float64)
+        image = SpotImage(np.where(good, calibrated, np.median(calibrated[good])).astype(np.float64))
         if self._width_px is None:
             fwhm_px = self.pipeline.plan.typical_fwhm_px
             self._width_px = spot_width(image, self._lattice) if fwhm_px is None else fwhm_px / _FWHM_OF_STD

@@ -39,7 +39,7 @@ from faintspot.slopes.sensor.background import (
     varies,
 )
 from faintspot.slopes.sensor.binning import scaled_points
-from faintspot.slopes.sensor.found_layout import FoundLayout, KnownGrid, find_illuminated, find_layout
+from faintspot.slopes.sensor.found_layout import FoundLayout, KnownGrid, find_grid, find_layout
 from faintspot.slopes.sensor.layout import OPTICS, Layout
 from faintspot.slopes.sensor.region import neighbour_vectors
 from faintspot.slopes.sensor.window_checks import LARGEST_WINDOW, window_size
@@ -172,13 +172,14 @@ def first_layout(
     mean, first, saturation_adu, notes = _usual_frames(source, calibration)
     hot = find_hot_pixels(mean) if mask_hot_pixels else np.empty((0, 2), np.int64)
     mean[tuple(hot.T)] = np.nan
+    has_dark = calibration.dark is not None
     shown, unused = (mean, []) if grid is not None else _clearer_frame(mean, calibration)
 
     def found_in_bins(factor: int) -> FoundLayout | KnownGrid:
         if factor == 1:
-            return _found(shown, grid, calibration.dark is not None, options)
+            return found_in(shown, grid, has_dark=has_dark, **options)
         image, choices = binned(shown, factor).astype(np.float64), _binned_options(options, factor)
-        return _found(image, grid, calibration.dark is not None, choices).magnified(factor, source.shape)
+        return found_in(image, grid, has_dark=has_dark, **choices).magnified(factor, source.shape)
 
     with errors_within(source.description):
         found = found_in_bins(factor)
@@ -217,14 +218,15 @@ def first_layout(
     return FirstLayout(layout, result.calibration, seen, found, mean, unit, result.notes)
 
 
-def _found(
-    mean: Floats, grid: tuple[int, int] | None, has_dark: bool, options: Mapping[str, Any]
+def found_in(
+    mean: Floats, grid: tuple[int, int] | None = None, *, has_dark: bool = False, **options: Any
 ) -> FoundLayout | KnownGrid:
     """Find the sub-apertures in a frame; refuse frames of a colour camera."""
-    if grid is not None:
-        return find_illuminated(mean, grid, has_dark=has_dark, **options)
     bad = np.isnan(mean)
-    found = find_layout(np.where(bad, 0, mean), bad_pixels=bad, **options)
+    searched = {"bad_pixels": bad, "grid": grid, **options}
+    if grid is not None:
+        return find_grid(mean, grid, has_dark, searched)
+    found = find_layout(np.where(bad, 0, mean), **searched)
     lenslets = found.lenslets
     contrast = mosaic_contrast(mean, lenslets.spots, lenslets.pitch_px, lenslets.spot_px)
     if contrast > 1:

@@ -14,6 +14,7 @@ from faintspot.base.statistics import MAD_TO_STD
 from faintspot.slopes.kernels.host import lanes_for
 from faintspot.slopes.kernels.validity.doubtful import Expected, doubtful_scratch_size, flag_doubtful
 from faintspot.slopes.sensor.binning import magnified_layout, scaled_points
+from faintspot.slopes.sensor.detection.fits import MOST
 from faintspot.slopes.sensor.detection.lenslets import LensletGrid
 from faintspot.slopes.sensor.layout import Layout
 from faintspot.slopes.sensor.region import LEAST_DIFFERENCE, PupilRegion, Rectangle, lines_of, neighbours_of
@@ -144,6 +145,7 @@ def _dim(grid: LensletGrid) -> NDArray[np.bool_]:
     return np.asarray(grid.flux < np.where(is_edge, _EDGE_GHOST, _GHOST) * near)
 
 
+_CENTRED = 0.3  # of a cell: largest distance of a spot from its middle
 _LIT_FRACTION = 0.3
 _BRIGHT = 0.95  # quantile of the flux, relative to which cells are selected for the median
 _CLOSE, _DOUBTFUL = 1.25, 0.05
@@ -184,6 +186,40 @@ class KnownGrid:
         """Return the grid of a binned frame in the pixels of the camera, of frames of `frame_shape`."""
         layout = magnified_layout(self.layout, factor, frame_shape)
         return replace(self, layout=layout, unlit=self.unlit / factor**2)
+
+
+def find_grid(
+    frame: NDArray[np.float64], shape: tuple[int, int], has_dark: bool, options: dict[str, Any]
+) -> FoundLayout | KnownGrid:
+    """Find a grid of which rows and columns are known: its spots, or cells that fill the frame.
+
+    Up to 4 x 4 spots may be anywhere, unless a pupil is stated or they are in such cells.
+
+    Parameters
+    ----------
+    frame : (h, w) array
+        Mean of the frames; NaN for bad pixels.
+    shape : (int, int)
+    has_dark : bool
+    options : dict
+        Options of `find_layout`. Those that `find_illuminated` does not have are for spots anywhere.
+    """
+    filling = {name: options.get(name) for name in ("pixels", "illuminated_fraction", "pupil", "roi")}
+    if max(shape) > MOST or filling["pupil"] is not None:
+        return find_illuminated(frame, shape, has_dark=has_dark, **filling)
+    try:
+        found = find_layout(np.nan_to_num(frame), **options)
+    except InputError:
+        if any(options.get(name) is not None for name in ("pitch_px", "angle_deg", "centre")):
+            raise
+        return find_illuminated(frame, shape, has_dark=has_dark, **filling)
+    part = Rectangle.given(filling["roi"], frame.shape)
+    pitch = np.array([part.x1 - part.x0, part.y1 - part.y0]) / shape[::-1]
+    place = (found.lenslets.spots - (part.x0, part.y0) + 0.5) / pitch
+    fills = np.abs(place % 1 - 0.5).max() < _CENTRED and len(np.unique(place // 1, axis=0)) == len(place)
+    if fills and (shape == (1, 1) or found.lenslets.pitch_px > (1 - _CENTRED) * pitch.min()):
+        return find_illuminated(frame, shape, has_dark=has_dark, **filling)
+    return found
 
 
 def find_illuminated(
@@ -267,6 +303,8 @@ def _whole_grid(
 
 def _illuminated(flux: NDArray[np.float64], fraction: float, has_dark: bool) -> tuple[NDArray[np.bool_], str]:
     """Return which cells are illuminated, and the reason why that may be wrong."""
+    if len(flux) == 1:
+        return np.ones(1, dtype=bool), ""
     background = 0.0 if has_dark else _dark_level(flux)
     if np.isnan(background):
         doubt = "no cell is clearly dark, all are used; give --dark or --pupil to select them"

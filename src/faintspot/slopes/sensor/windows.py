@@ -90,7 +90,7 @@ def find_windows(
         If no regular array of spots is found, or no window is within the frame.
     """
     window = None if pixels is None else window_size("pixels", pixels)
-    found = find_lenslets(frame, pitch_px=pitch_px, **options)
+    found = find_lenslets(frame, pitch_px=pitch_px, angle_deg=angle_deg, **options)
     grid, fitted = with_stated(found, pitch_px=pitch_px, angle_deg=angle_deg, centre=centre, fit=fit)
     height, width = np.shape(frame)[-2:]
     shape = (height, width)

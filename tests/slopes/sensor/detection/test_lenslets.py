@@ -70,11 +70,9 @@ def spots_at(positions: list[tuple[int, int]]) -> NDArray[np.float64]:
 @pytest.mark.parametrize(
     "image",
     mostly_slow(
-        5,
+        3,
         [
             spots_at([]),
-            spots_at([(50, 60)]),
-            spots_at([(50, 60), (80, 91)]),
             spots_at([(11, 20), (30, 100), (58, 47), (70, 113), (101, 9), (109, 76)]),
             np.full((64, 64), 7.0),
             np.zeros((64, 64), dtype=np.int16),
@@ -85,7 +83,7 @@ def spots_at(positions: list[tuple[int, int]]) -> NDArray[np.float64]:
             np.full((40, 40), np.nan),
         ],
     ),
-    ids=["noise", "one spot", "two spots", "scattered spots", "flat", "zero", "gradient", *"abcd"],
+    ids=["noise", "scattered spots", "flat", "zero", "gradient", *"abcd"],
 )
 def test_no_lattice_is_an_error_in_one_line(image: NDArray[Any]) -> None:
     with refused("frame"):

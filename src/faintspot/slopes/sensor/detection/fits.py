@@ -1,5 +1,7 @@
 """Lattices fitted to the spots of a frame, and the choice of the one that explains them best."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -10,6 +12,7 @@ from faintspot.slopes.sensor.background import least_difference, lenslet_backgro
 from faintspot.slopes.sensor.detection.acquisition import follow
 from faintspot.slopes.sensor.detection.candidates import Lattice, find_candidates
 from faintspot.slopes.sensor.detection.illumination import (
+    FAINT,
     LIKE,
     Illumination,
     find_illumination,
@@ -19,6 +22,7 @@ from faintspot.slopes.sensor.detection.nodes import (
     Drift,
     NodeFlux,
     SpotFlux,
+    SpotImage,
     find_spots,
     inside_frame,
     levels_between,
@@ -56,6 +60,11 @@ _SPARE, _SPARE_PART, _FEW = 3, 0.02, 40
 _LARGEST_ERROR, _ERROR, _ALIKE = 0.03, 0.012, 0.3
 # Fewest lit lenslets, and fewest pairs of neighbouring spots in each direction: one pair is a coincidence.
 FEWEST, _PAIRS = 4, 1.4
+MOST = 4
+"""Largest number of rows and columns that are searched for spot by spot."""
+DIM = 0.4
+"""Flux that a lenslet may have, relative to the median."""
+_BEYOND = 0.25  # pitches outside the frame up to which a fit may move nodes into it
 
 
 @dataclass(frozen=True)
@@ -74,6 +83,28 @@ class LatticeFit:
     elsewhere: NDArray[np.complex128]
     dim: NDArray[np.complex128]
     shape: tuple[int, ...]
+    few: bool = False
+    """Whether it is an array of at most 4 x 4 lenslets that was found spot by spot."""
+
+    @property
+    def is_sensor(self) -> bool:
+        """Whether there are lenslets enough for a sensor."""
+        cells = self.spots.cells[self.illuminated.nodes]
+        return self.few or (len(cells) >= FEWEST and bool(np.all(np.ptp(cells, axis=0) > 0)))
+
+    @property
+    def is_certain(self) -> bool:
+        """Whether there is no doubt, nor so few lenslets that some may be hidden in the noise."""
+        if not self.is_sensor or self.illuminated.doubt:
+            return False
+        lit = self.illuminated.nodes
+        ratio, across = self.spots.signal_to_noise[lit], np.ptp(self.spots.cells[lit], axis=0) + 1
+        return bool(across.max() > MOST or min(ratio.min(), DIM * np.median(ratio)) > FAINT)
+
+    def is_better(self, few: LatticeFit) -> bool:
+        """Whether this fit is to be used instead of one that was found spot by spot."""
+        doubtful = bool(few.illuminated.doubt) or not self.illuminated.doubt
+        return self.is_sensor and doubtful and self.lit > few.lit
 
     @property
     def lit(self) -> int:
@@ -133,9 +164,12 @@ def best_fit(
     if not np.ptp(image) > 0:
         return None
     image = image - np.median(image)
-    best, highest = None, -1.0
+    best, highest, smoothed = None, -1.0, SpotImage(image)
     for score, lattice in find_candidates(image, geometries, pitch_range_px):
-        fit = _fitted(image, lattice, illuminated_fraction, pupil)
+        nodes = len(lattice.cells_inside(image.shape, -_BEYOND * lattice.pitch_px))
+        if score * nodes < _PAIRS or score <= _SUFFICIENT * highest:
+            continue  # whatever its fit
+        fit = _fitted(smoothed, lattice, illuminated_fraction, pupil)
         explained = fit.explained
         if explained > 0 and score * np.count_nonzero(fit.illuminated.nodes) < _PAIRS:
             continue
@@ -150,7 +184,7 @@ def best_fit(
     for number in range(_REFITS):
         if (even := _without_background(image, best, in_steps=number == 0)) is None:
             break
-        fit = _fitted(even, best.lattice, illuminated_fraction, pupil)
+        fit = _fitted(SpotImage(even), best.lattice, illuminated_fraction, pupil)
         if fit.lit < FEWEST:
             break
         best = fit
@@ -201,7 +235,7 @@ def _without_background(
 
 
 def _fitted(
-    image: NDArray[np.float64],
+    image: SpotImage,
     lattice: Lattice,
     illuminated_fraction: float | None,
     pupil: PupilRegion | None,
@@ -220,6 +254,9 @@ def _fitted(
         lattice = lattice.fitted(spots.cells[used], spots.positions[used]).canonical(image.shape)
         if abs(lattice.step - before.step) * max(image.shape) < 0.02 * abs(lattice.step) ** 2:
             break
+    if np.count_nonzero(used) < FEWEST:
+        nothing = np.empty(0, dtype=np.complex128)
+        return LatticeFit(lattice, width_px, spots, illuminated, nothing, nothing, nothing, image.shape)
     everywhere = find_spots(image, lattice, width_px)
     fit = _illuminated_of(image, lattice, width_px, illuminated_fraction, everywhere)
     for _ in range(_FIT_PASSES):
@@ -245,13 +282,7 @@ def _unclear(fit: LatticeFit) -> str:
     elsewhere, dark = fit.unexplained
     count = fit.lit
     if fit.explained > _CERTAIN and elsewhere < (1 if count < _FEW else max(_SPARE, _SPARE_PART * count)):
-        largest, error, alike = fit.displacements
-        if error < (_ERROR if alike > _ALIKE else _LARGEST_ERROR):
-            return ""
-        return (
-            f"spots lie up to {largest:.2f} of the pitch from the lattice, and {count} lit lenslets tell its "
-            f"pitch to {error:.1%} only; give pitch_px if it is known"
-        )
+        return pitch_doubt(fit)
     return (
         f"the lattice explains only a part of the flux: {elsewhere} bright spots belong to none of its "
         f"{count} lit lenslets, and {dark} dark ones lie between these; its pitch or geometry may be wrong, "
@@ -259,8 +290,19 @@ def _unclear(fit: LatticeFit) -> str:
     )
 
 
+def pitch_doubt(fit: LatticeFit) -> str:
+    """Return a one-line warning if the spots are displaced too far to tell the pitch."""
+    largest, error, alike = fit.displacements
+    if error < (_ERROR if alike > _ALIKE else _LARGEST_ERROR):
+        return ""
+    return (
+        f"spots lie up to {largest:.2f} of the pitch from the lattice, and {fit.lit} lit lenslets tell its "
+        f"pitch to {error:.1%} only; give pitch_px if it is known"
+    )
+
+
 def _illuminated_of(
-    image: NDArray[np.float64],
+    image: SpotImage,
     lattice: Lattice,
     width_px: float,
     illuminated_fraction: float | None,

@@ -49,7 +49,7 @@ _SCATTER = (0.1, 0.6)
 _SHARE = 0.1
 # Lenslets with flux within this factor of the dividing flux are ambiguous; a warning is given if their share
 # of the illuminated ones exceeds this limit, or if spots are less significant than this.
-_CLOSE, _DOUBTFUL, _FAINT = 1.25, 0.15, 6.0
+_CLOSE, _DOUBTFUL, FAINT = 1.25, 0.15, 6.0
 # Peaks distributed over the search area have a median distance of 0.25 pitch from its centre; spots have
 # less.
 _SCATTERED = 0.2
@@ -167,7 +167,9 @@ def _even_illumination(spots: NodeFlux, lattice: Lattice, illuminated_fraction: 
         illuminated &= spots.flux >= illuminated_fraction * reference
         fraction = illuminated_fraction
     return Illumination(
-        illuminated, _doubt(spots, illuminated, detected, fraction * reference), fraction * reference
+        illuminated,
+        illumination_doubt(spots, illuminated, detected, fraction * reference),
+        fraction * reference,
     )
 
 
@@ -286,7 +288,7 @@ def _connected(
     return np.asarray(illuminated & (sizes >= max(2, _SHARE * sizes.max()))[part])
 
 
-def _doubt(
+def illumination_doubt(
     spots: NodeFlux, illuminated: NDArray[np.bool_], detected: NDArray[np.float64], dividing_flux: float
 ) -> str:
     """Return the reason why the result may be wrong, in one line."""
@@ -295,7 +297,7 @@ def _doubt(
         return ""
     flux = spots.flux[illuminated]
     ratio = float(np.median(spots.signal_to_noise[illuminated]))
-    if ratio < _FAINT:
+    if ratio < FAINT:
         return f"the spots are only {ratio:.1f} standard deviations above the noise; average more frames"
     if (scatter := spots.scatter(illuminated)) > _SCATTERED:
         return (

@@ -10,11 +10,13 @@ from numpy.typing import NDArray
 from faintspot.base.checks import finite_array, number_between, one_of, real_array
 from faintspot.base.errors import InputError
 from faintspot.slopes.sensor.detection.candidates import RATIOS, SMALLEST_PITCH_PX, Lattice, robust_std
-from faintspot.slopes.sensor.detection.fits import FEWEST, LatticeFit, best_fit
+from faintspot.slopes.sensor.detection.few_spots import Stated, few_spots
+from faintspot.slopes.sensor.detection.fits import LatticeFit, best_fit
 from faintspot.slopes.sensor.region import PupilRegion, Rectangle, as_rows, as_tree
 
 _MOST_FOR_NOISE = 50_000  # pixels; the robust deviation of so many is known to 1 %
 _SMALLEST_GIVEN_PITCH_PX = 4
+_KNOWN = "--grid of faintspot layout states an array of up to 4 x 4 lenslets, or quad cells"
 # Distance from a node (pitches) within which a hot pixel may be a sharp spot, and standard deviations by
 # which there must be more of these than of hot pixels by chance; and which part of them must be.
 _ON_NODE, _BEYOND_CHANCE, _MOSTLY = 0.2, 5.0, 0.7
@@ -80,6 +82,8 @@ def find_lenslets(
     illuminated_fraction: float | None = None,
     pupil: object = None,
     roi: object = None,
+    angle_deg: float | None = None,
+    grid: tuple[int, int] | None = None,
 ) -> LensletGrid:
     """Find the lenslet grid in a frame without prior knowledge of the sensor.
 
@@ -88,7 +92,8 @@ def find_lenslets(
     chosen all together (see `illumination`). The first lattice is used whose lenslets have almost all of the
     bright spots and few dark ones between them; there is a doubt if no lattice has. An illuminated lenslet
     has a spot that stands out of the noise of its own cell, enough flux above its own background, and
-    mostly illuminated neighbours. Lenslets at the edge of the pupil with low flux and those behind the
+    mostly illuminated neighbours. Arrays of at most 4 x 4 lenslets, down to a single one, are found spot by
+    spot (see `few_spots`). Lenslets at the edge of the pupil with low flux and those behind the
     central obstruction are therefore omitted. So are lenslets whose node is within 0.12 pitch of the edge
     of the frame.
 
@@ -109,6 +114,10 @@ def find_lenslets(
         Disk or annulus in pixels: lenslets with nodes inside are used, whatever their flux.
     roi : (x0, y0, x1, y1), optional
         Part of the frame to use: columns x0 to x1 - 1 and rows y0 to y1 - 1.
+    angle_deg : float, optional
+        Angle of the rows, for an array of at most 4 x 4 lenslets.
+    grid : (int, int), optional
+        Rows and columns of such an array, in either order.
 
     Returns
     -------
@@ -118,8 +127,7 @@ def find_lenslets(
     Raises
     ------
     InputError
-        If arguments are invalid, or no lattice of at least four illuminated lenslets in two rows and two
-        columns stands out of the noise.
+        If arguments are invalid, or no lattice stands out of the noise.
 
     Notes
     -----
@@ -139,10 +147,17 @@ def find_lenslets(
     hot = _hot_pixels(raw) & ~bad[part.slices]
     geometries = tuple(RATIOS) if geometry == "auto" else (geometry,)
     pitch_range_px = _pitch_range(pitch_px, raw.shape)
+    stated = Stated(geometries, pitch_px, angle_deg, grid)
 
     def fitted(bad: NDArray[np.bool_]) -> tuple[NDArray[np.float64], LatticeFit | None]:
         image = np.where(bad, _median_of_good(raw, bad), raw)
-        return image, best_fit(image, geometries, pitch_range_px, illuminated_fraction, circle)
+        fit = None
+        if grid is None:
+            fit = best_fit(image, geometries, pitch_range_px, illuminated_fraction, circle)
+        if circle is not None or (fit is not None and fit.is_certain):
+            return image, fit
+        few = few_spots(image, stated)
+        return image, fit if few is None or (fit is not None and fit.is_better(few)) else few
 
     image, fit = fitted(bad[part.slices] | hot)
     if fit is not None and (on_lattice := _hot_on_lattice(hot, fit)).any():
@@ -153,7 +168,7 @@ def find_lenslets(
         raise InputError(_nothing_found(image, pitch_range_px, geometry))
     lattice, spots, illuminated = fit.lattice, fit.spots, fit.illuminated
     cells = spots.cells[illuminated.nodes]
-    if len(cells) < FEWEST or np.any(np.ptp(cells, axis=0) < 1):
+    if not fit.is_sensor:
         raise InputError(_too_few(len(cells), lattice, circle))
     at = lattice.positions(cells) + corner
     return LensletGrid(
@@ -194,7 +209,7 @@ def _nothing_found(image: NDArray[np.float64], pitch_range_px: tuple[float, floa
     return (
         f"frame: found no {kind} lattice of spots with a pitch of {pitch_range_px[0]:.1f} to "
         f"{pitch_range_px[1]:.1f} px above the noise; average more frames, or state the pitch or bad pixels; "
-        "--grid of faintspot layout is for an array that is known, such as quad cells"
+        + _KNOWN
     )
 
 
@@ -206,7 +221,7 @@ def _too_few(count: int, lattice: Lattice, pupil: PupilRegion | None) -> str:
         return f"{found}{count} of its lenslets lie in the pupil given, {expected}"
     return (
         f"{found}only {count} of its lenslets are lit for certain, {expected}; average more frames, or state "
-        "the pitch"
+        f"the pitch; {_KNOWN}"
     )
 
 
@@ -228,7 +243,10 @@ def _checked(frame: object, bad_pixels: object) -> tuple[NDArray[np.generic], ND
 def _mean_image(frames: NDArray[Any], bad: NDArray[np.bool_]) -> NDArray[np.float64]:
     """Return the mean frame, float64, with bad pixels replaced by the median around them."""
     if min(frames.shape[-2:]) < 2 * SMALLEST_PITCH_PX:
-        raise InputError(f"frame: expected at least 10 x 10 pixels, got shape {frames.shape}")
+        raise InputError(
+            f"frame: expected at least 10 x 10 pixels, got shape {frames.shape}; --grid 1x1 of faintspot "
+            "layout is for a quad cell"
+        )
     if bad.mean() > 0.5:
         raise InputError(
             f"bad_pixels: {bad.sum()} of {bad.size} pixels are bad, expected at most half; good ones are 0"

@@ -6,7 +6,7 @@ and noise in one part of the frame does not hide spots in another.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import scipy
@@ -32,6 +32,9 @@ _CERTAIN = 4.0
 # times too wide or narrow keeps 0.9 of the signal-to-noise ratio.
 _SHARPEST_PX, _BROADEST = 0.6, 0.25
 _WIDTHS, _STARTS = 9, (1, 4, 7)
+_RUNG = 1.25  # ratio of the widths of these filters, the same for all lattices
+# Width from which on boxes stand for a Gaussian, and their number; smoothed images that are kept.
+_WIDE_PX, _BOXES, _MOST_KEPT = 8.0, 3, 16
 _MOST_FOR_WIDTH = 500  # spots; their width is then known far more precisely than needed
 _MOST_FOR_NOISE = 50_000  # pixels; the robust deviation of so many is known to 1 %
 
@@ -41,6 +44,65 @@ Drift = Callable[[NDArray[np.complex128]], NDArray[np.complex128]]
 def no_drift(nodes: NDArray[np.complex128]) -> NDArray[np.complex128]:
     """Return displacements of zero, for spots expected at their nodes."""
     return np.zeros_like(nodes)
+
+
+@dataclass(frozen=True, eq=False)
+class SpotImage:
+    """Pixels (ny, nx), and how they look smoothed: computed once for all lattices that are tried.
+
+    Parameters
+    ----------
+    pixels : array (ny, nx)
+    """
+
+    pixels: NDArray[np.float64]
+    _known: dict[tuple[str, float], NDArray[np.float64]] = field(default_factory=dict)
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Height and width."""
+        return self.pixels.shape
+
+    def haze(self, pitch_px: float) -> NDArray[np.float64]:
+        """Return the mean over a pitch around each pixel, to which regular spots contribute evenly."""
+        side = round(pitch_px)
+        return self._once("haze", side, lambda: _box(_box(self.pixels, side, "nearest"), 3, "nearest"))
+
+    def smooth(self, width_px: float) -> NDArray[np.float64]:
+        """Return the image under a Gaussian, or one made of boxes if that is wide.
+
+        It is dark outside the frame: a mirrored spot would shift the peak to the edge.
+        """
+        return self._once("smooth", width_px, lambda: _smooth(self.pixels, width_px))
+
+    def _once(
+        self, kind: str, size: float, compute: Callable[[], NDArray[np.float64]]
+    ) -> NDArray[np.float64]:
+        """Return what was computed for this size, among the last few."""
+        if (kind, size) not in self._known:
+            while len(self._known) >= _MOST_KEPT:
+                del self._known[next(iter(self._known))]
+            self._known[kind, size] = compute()
+        return self._known[kind, size]
+
+    def band(self, lattice: Lattice, width_px: float) -> NDArray[np.float64]:
+        """Return the smoothed image without the haze around the spots."""
+        return np.asarray(self.smooth(width_px) - self.haze(lattice.pitch_px))
+
+
+def _box(image: NDArray[np.float64], side: int, mode: str) -> NDArray[np.float64]:
+    return np.asarray(scipy.ndimage.uniform_filter(image, side, mode=mode))
+
+
+def _smooth(image: NDArray[np.float64], width_px: float) -> NDArray[np.float64]:
+    """Smooth by a Gaussian, or by boxes whose variances have the same sum (Kovesi 2010, Proc. DICTA, 345)."""
+    if width_px < _WIDE_PX:
+        return np.asarray(scipy.ndimage.gaussian_filter(image, width_px, mode="constant", truncate=3.0))
+    side = int((np.sqrt(4 * width_px**2 + 1) - 1) / 2) * 2 + 1
+    narrow = round((12 * width_px**2 - _BOXES * (side + 1) * (side + 3)) / (-4 * side - 4))
+    for index in range(_BOXES):
+        image = _box(image, side if index < narrow else side + 2, "constant")
+    return image
 
 
 @dataclass(frozen=True)
@@ -94,22 +156,19 @@ class NodeFlux(SpotFlux):
         return float(np.median(np.abs(shifts - middle)))
 
 
-def measure_nodes(
-    image: NDArray[np.float64], lattice: Lattice, width_px: float, drift: Drift = no_drift
-) -> NodeFlux:
+def measure_nodes(image: SpotImage, lattice: Lattice, width_px: float, drift: Drift = no_drift) -> NodeFlux:
     """Measure the spot of each node whose spot is expected inside the frame.
 
     Parameters
     ----------
-    image : array (ny, nx)
+    image : SpotImage
     lattice : Lattice
     width_px : float
         Standard deviation of the spot shape.
     drift : function
         Function that returns the expected displacements [px] of the spots of nodes at x + 1j * y.
     """
-    haze = _haze(image, lattice)
-    band = _band(image, haze, width_px)
+    band = image.band(lattice, width_px)
     margin_px = _MARGIN * lattice.pitch_px
     cells = lattice.cells_inside(image.shape, margin_px if drift is no_drift else -REACH * lattice.pitch_px)
     drifts = drift(lattice.positions(cells))
@@ -117,18 +176,17 @@ def measure_nodes(
     inside = inside_frame(at, image.shape, margin_px - 0.5)
     cells, drifts, at = cells[inside], drifts[inside], at[inside]
     peaks, _ = _peaks(band, lattice, at)
-    spots = _measured(image, band, haze, lattice, width_px, peaks)
+    spots = _measured(image, band, lattice, width_px, peaks)
     return NodeFlux(**vars(spots), cells=cells, drifts=drifts, shifts=(peaks - at) / lattice.pitch_px)
 
 
-def find_spots(image: NDArray[np.float64], lattice: Lattice, width_px: float) -> SpotFlux:
+def find_spots(image: SpotImage, lattice: Lattice, width_px: float) -> SpotFlux:
     """Measure all peaks of a frame that are clearly spots, at any position."""
-    haze = _haze(image, lattice)
-    band = _band(image, haze, width_px)
+    band = image.band(lattice, width_px)
     side = 2 * max(1, int(_APART * lattice.pitch_px)) + 1
     high = (band == scipy.ndimage.maximum_filter(band, side)) & (band > _CERTAIN * _noise(band, lattice))
     y, x = np.nonzero(high)
-    return _measured(image, band, haze, lattice, width_px, x + 1j * y)
+    return _measured(image, band, lattice, width_px, x + 1j * y)
 
 
 def levels_between(
@@ -149,16 +207,15 @@ def inside_frame(at: NDArray[np.complex128], shape: tuple[int, ...], margin_px: 
 
 
 def _measured(
-    image: NDArray[np.float64],
+    image: SpotImage,
     band: NDArray[np.float64],
-    haze: NDArray[np.float64],
     lattice: Lattice,
     width_px: float,
     peaks: NDArray[np.complex128],
 ) -> SpotFlux:
     """Fit a spot and a plane to the pixels around each peak."""
     offsets = _cell_offsets(lattice)
-    values = _around(image, peaks, offsets)
+    values = _around(image.pixels, peaks, offsets)
     inside = ~np.isnan(values)
     values = np.where(inside, values, 0.0)
     model = _model(offsets, lattice, width_px)
@@ -167,9 +224,9 @@ def _measured(
     residual = np.where(inside, values - numbers @ model.T, 0.0)
     # Use the noise of the background: for bright spots, residuals are dominated by the shape of the spot.
     weight = (1 - spot) ** 2
-    least = (1e-9 * float(np.ptp(image))) ** 2
+    least = (1e-9 * float(np.ptp(image.pixels))) ** 2
     white = np.maximum((residual**2 @ weight) / np.maximum(inside @ weight, 1e-12), least)
-    variance = white + _coloured(image, band, lattice, width_px)
+    variance = white + _coloured(image.pixels, band, lattice, width_px)
     near = np.abs(offsets) <= max(1.5, min(2.5 * width_px, 0.5 * lattice.pitch_px))
     fitted = (numbers[:, 3:] * spot)[:, near]
     flux = (residual[:, near] + fitted).sum(axis=1)
@@ -177,7 +234,7 @@ def _measured(
     height = np.maximum(numbers[:, 3], 1e-30)
     slopes = numbers[:, 1:3] / lattice.pitch_px + _leaning(residual, offsets, spot)
     return SpotFlux(
-        peaks + _subpixel(band + haze, peaks, slopes),
+        peaks + _subpixel(image.smooth(width_px), peaks, slopes),
         flux,
         np.sqrt(variance * np.count_nonzero(near)),
         numbers[:, 3] / np.sqrt(variance * inverse[:, 3, 3]),
@@ -195,25 +252,27 @@ def _leaning(
     return np.asarray(residual @ across.T / (along * across).sum(axis=1))
 
 
-def spot_width(image: NDArray[np.float64], lattice: Lattice) -> float:
+def spot_width(image: SpotImage, lattice: Lattice, nodes: NDArray[np.complex128] | None = None) -> float:
     """Return the standard deviation [px] of the Gaussian that is most similar to the spots.
 
-    It has the highest total signal-to-noise ratio of the fits, over all spots.
+    It has the highest total signal-to-noise ratio of the fits, over all spots, or over those of these nodes.
     """
     widest = max(1.2, _BROADEST * lattice.pitch_px)
     widths = np.geomspace(_SHARPEST_PX, widest, _WIDTHS)
-    cells = lattice.cells_inside(image.shape, _MARGIN * lattice.pitch_px)
+    all_nodes = lattice.positions(lattice.cells_inside(image.shape, _MARGIN * lattice.pitch_px))
     offsets = _cell_offsets(lattice)
-    haze = _haze(image, lattice)
     best = (-np.inf, float(widths[0]))
     for start in _STARTS:
-        band = _band(image, haze, float(widths[start]))
-        peaks, heights = _peaks(band, lattice, lattice.positions(cells))
+        start_px = _SHARPEST_PX * _RUNG ** round(np.log(widths[start] / _SHARPEST_PX) / np.log(_RUNG))
+        band = image.band(lattice, start_px)
+        peaks, heights = _peaks(band, lattice, all_nodes if nodes is None else nodes)
         certain = np.flatnonzero(heights >= _CERTAIN * _noise(band, lattice))
-        if len(certain) < 4:
+        if nodes is not None:
+            certain = np.arange(len(nodes))
+        elif len(certain) < 4:
             continue
         chosen = certain[:: -(-len(certain) // _MOST_FOR_WIDTH)]
-        values = _around(image, peaks[chosen], offsets)
+        values = _around(image.pixels, peaks[chosen], offsets)
         inside = ~np.isnan(values)
         for width in widths:
             numbers, inverse = _fits(np.where(inside, values, 0.0), inside, _model(offsets, lattice, width))
@@ -222,21 +281,6 @@ def spot_width(image: NDArray[np.float64], lattice: Lattice) -> float:
             score = float(np.minimum(ratio, 3 * np.median(ratio)).mean()) * len(certain)
             best = max(best, (score, float(width)))
     return best[1]
-
-
-def _haze(image: NDArray[np.float64], lattice: Lattice) -> NDArray[np.float64]:
-    """Return the mean over a pitch around each pixel, to which regular spots contribute evenly."""
-    haze = scipy.ndimage.uniform_filter(image, round(lattice.pitch_px), mode="nearest")
-    return np.asarray(scipy.ndimage.uniform_filter(haze, 3, mode="nearest"))
-
-
-def _band(image: NDArray[np.float64], haze: NDArray[np.float64], width_px: float) -> NDArray[np.float64]:
-    """Return the smoothed image without the haze around the spots.
-
-    It is dark outside the frame: a mirrored spot would shift the peak to the edge.
-    """
-    smooth = scipy.ndimage.gaussian_filter(image, width_px, mode="constant", truncate=3.0)
-    return np.asarray(smooth - haze)
 
 
 def _disc(radius_px: float) -> NDArray[np.complex128]:
