@@ -25,6 +25,7 @@ _SHARPEST_PX, _STEP, _BROADEST = 0.7, 1.4, 0.2
 _MOST_PX = 2.5  # width [px] from which on pixels are binned
 # Noise of a difference of Gaussians whose second is twice as wide, times the width [px], in white noise of 1.
 _WHITE = float(np.sqrt(0.45 / (4 * np.pi)))
+_MOST_FOR_PLANE = 50_000  # pixels
 _TILE_PX = 16  # side of the parts of the image whose noise is measured
 _NOISE_FLOOR = 1e-3  # of the highest peak
 # Significance of peaks, and from which on one without a node counts; largest number of peaks.
@@ -102,11 +103,14 @@ def few_spots(image: NDArray[np.float64], stated: Stated) -> LatticeFit | None:
 
 def _flattened(image: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the image without the plane that fits what is not bright."""
-    middle, scatter = np.median(image), robust_std(image)
-    y, x = np.indices(image.shape).reshape(2, -1)
-    columns = np.column_stack([np.ones(image.size), x, y])
-    plane = np.linalg.lstsq(columns, np.clip(image.ravel(), middle - 3 * scatter, middle + 3 * scatter))[0]
-    return np.asarray(image - (columns @ plane).reshape(image.shape))
+    every = max(1, int(np.sqrt(image.size / _MOST_FOR_PLANE)))
+    sample = image[::every, ::every]
+    middle, scatter = np.median(sample), robust_std(sample)
+    y, x = every * np.indices(sample.shape).reshape(2, -1)
+    values = np.clip(sample.ravel(), middle - 3 * scatter, middle + 3 * scatter)
+    level, down, right = np.linalg.lstsq(np.column_stack([np.ones(len(x)), y, x]), values)[0]
+    plane = level + down * np.arange(image.shape[0])[:, None] + right * np.arange(image.shape[1])
+    return np.asarray(image - plane)
 
 
 def _levels(image: NDArray[np.float64]) -> Iterator[_Peaks]:
@@ -155,22 +159,11 @@ def _best_match(peaks: _Peaks, stated: Stated) -> _Match | None:
         side = _SINGLE * _FWHM * peaks.width_px
         lattice = Lattice("square", complex(at[0]), complex(side))
         best = _Match(float(worth[0]) - elsewhere, lattice, at[:1], peaks)
-    first, second = np.triu_indices(len(at), 1)
-    times = np.repeat(np.arange(1, MOST), len(first))
-    first, second = np.tile(first, MOST - 1), np.tile(second, MOST - 1)
     for geometry in stated.geometries:
-        ratio, quarter = RATIOS[geometry], 90.0 if geometry == "square" else 60.0
-        step = (at[second] - at[first]) / times
-        step *= np.exp(-1j * np.radians(quarter * np.rint(np.degrees(np.angle(step)) / quarter)))
-        used = np.abs(step) > _APART * peaks.width_px
-        if stated.pitch_px is not None:
-            used &= np.abs(np.log(np.abs(step) / stated.pitch_px)) < np.log(_PITCH)
-        if stated.angle_deg is not None:
-            turn = (np.degrees(np.angle(step)) - stated.angle_deg + quarter / 2) % quarter - quarter / 2
-            used &= np.abs(turn) < _ANGLE_DEG
-        if not used.any():
+        ratio = RATIOS[geometry]
+        origin, step = _through_pairs(at, geometry, _APART * peaks.width_px, stated)
+        if not len(step):
             continue
-        step, origin = step[used], at[first[used]]
         away = (at - origin[:, None]) / step[:, None]
         row = np.rint(away.imag / ratio.imag)
         column = np.rint(away.real - row * ratio.real)
@@ -193,6 +186,23 @@ def _best_match(peaks: _Peaks, stated: Stated) -> _Match | None:
                 nodes = lattice.positions(np.column_stack([rows, columns]))
                 best = _Match(float(score[index]) - elsewhere, lattice, nodes, peaks)
     return best
+
+
+def _through_pairs(
+    at: NDArray[np.complex128], geometry: str, least_px: float, stated: Stated
+) -> tuple[NDArray[np.complex128], NDArray[np.complex128]]:
+    """Return origins and steps of the lattices that have two spots up to three nodes apart in a row."""
+    first, second = np.triu_indices(len(at), 1)
+    times, quarter = np.arange(1, MOST)[:, None], 90.0 if geometry == "square" else 60.0
+    step = ((at[second] - at[first]) / times).ravel()
+    step *= np.exp(-1j * np.radians(quarter * np.rint(np.degrees(np.angle(step)) / quarter)))
+    used = np.abs(step) > least_px
+    if stated.pitch_px is not None:
+        used &= np.abs(np.log(np.maximum(np.abs(step), 1e-9) / stated.pitch_px)) < np.log(_PITCH)
+    if stated.angle_deg is not None:
+        turn = (np.degrees(np.angle(step)) - stated.angle_deg + quarter / 2) % quarter - quarter / 2
+        used &= np.abs(turn) < _ANGLE_DEG
+    return np.tile(at[first], MOST - 1)[used], step[used]
 
 
 def _rectangles(grid: tuple[int, int] | None) -> Iterator[tuple[tuple[int, int], tuple[int, int]]]:
