@@ -101,7 +101,7 @@ def measure_scintillation(
         _seen("index of a sub-aperture", float(mean[0]), float(its_error[0])),
         _seen("index of the aperture", float(of_each[-1]), float(error[-1])),
         _half_width(pieces, rate),
-        *_fades(pieces, rate, level),
+        *_fades(pieces, seen.mean(axis=0) / seen.mean(axis=0).sum(), rate, level),
     ]
     return Scintillation(index, index_error, results)
 
@@ -220,13 +220,17 @@ def _half_width(pieces: _Pieces, rate_hz: float) -> Measured:
     return Measured(name, unit, value, math.hypot(error, _OF_NOISE * value))
 
 
-def _fades(pieces: _Pieces, rate_hz: float, level: float) -> list[Measured]:
-    """Return share and mean length of the fades of the aperture's light, where noise makes and ends few."""
+def _fades(pieces: _Pieces, parts: Floats, rate_hz: float, level: float) -> list[Measured]:
+    """Return share and mean length of the fades of the aperture's light, where noise makes and ends few.
+
+    `parts` (m - 1,) of the light are the sub-apertures': their noise is independent, and better known.
+    """
     names = f"share of frames below {level:g} of the mean", "mean length of a fade"
     every = np.ones(_PIECES)
     light = 1 + pieces.light[:, -1]
-    covariance, index = pieces.covariances(every)[:, -1], pieces.index(every)[-1]
-    noise, step = math.sqrt(max(covariance[0] - index, 0.0)), math.sqrt(max(2 * (index - covariance[1]), 0.0))
+    covariance, index = pieces.covariances(every), pieces.index(every)
+    noise = math.sqrt(max(float(np.square(parts) @ (covariance[0] - index)[:-1]), 0.0))
+    step = math.sqrt(max(2 * float(index[-1] - covariance[1, -1]), 0.0))
     noisier = light + noise * np.random.default_rng(1).standard_normal(len(light))
     below = light < level
     begins = below & ~np.concatenate([[False], below[:-1]])
