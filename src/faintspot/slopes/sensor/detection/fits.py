@@ -46,9 +46,9 @@ _REACHED, _FOLLOWED = 4, 0.15
 # several; those nearer to the edge of the frame may belong to a lenslet outside.
 _BETWEEN, _CUT = 0.45, 0.5
 # Part of the spots and nodes that a lattice explains if others need not be tried, unless its score as a
-# candidate is below this part of that of another; part below which there is a doubt; and part below which, of
+# candidate is below this part of that of another, and below which there is a doubt; and part below which, of
 # doubtful lattices, others with a lower score may be better.
-_EXPLAINED, _SUFFICIENT, _CERTAIN, _LITTLE = 0.8, 0.6, 0.85, 0.4
+_CERTAIN, _SUFFICIENT, _LITTLE = 0.85, 0.6, 0.4
 # Median distance of the spots from their nodes (pitches) above which a fit to them makes a lattice worse.
 _LOOSE = 0.18
 # Bright spots at no node, at least so many and this part of the lenslets, that also raise a doubt; one does
@@ -173,7 +173,7 @@ def best_fit(
         explained = fit.explained
         if explained > 0 and score * np.count_nonzero(fit.illuminated.nodes) < _PAIRS:
             continue
-        if explained > _EXPLAINED and score > _SUFFICIENT * highest:
+        if explained > _CERTAIN and score > _SUFFICIENT * highest:
             best = fit
             break
         rank = score * min(1.0, explained / _LITTLE)
