@@ -17,14 +17,13 @@ from numpy.typing import ArrayLike, NDArray
 from faintspot.base.arrays import Floats
 from faintspot.base.checks import increasing, number_between
 from faintspot.base.errors import InputError
+from faintspot.base.statistics import student
 from faintspot.loop.control.identification.open_loop import Measured
 
-FADE_LEVEL = 0.5
-"""Of the mean flux, below which the light of the aperture fades."""
 FEWEST_FRAMES = 400
 _PIECES = 20
 _LIT = 0.1  # of the flux of the brightest tenth, from which a sub-aperture counts
-_STUDENT = 2.093 / 1.96  # 95 % of so few pieces, over that of many
+_STUDENT = student(_PIECES - 1) / 1.96  # of so few pieces, over that of many
 _TO_FRAME = (3.0, -3.0, 1.0)  # a parabola through the covariances at lags of one to three frames, at lag 0
 _OF_LINE = 0.5  # of the difference to a straight line, as an error of the extrapolation
 _OF_NOISE = 0.04  # relative error of a frequency, of the noise that is taken off
@@ -35,17 +34,17 @@ _MOST_NOISE = 0.08  # of the change of the light from frame to frame
 
 @dataclass(frozen=True, eq=False)
 class Scintillation:
-    """What the fluxes of a recording tell of the light."""
+    """Scintillation of a recording's light."""
 
     index: Floats
     """(n,): variance of each sub-aperture's light over its mean squared; NaN with little flux."""
     index_error: Floats
     values: list[Measured]
-    """Of the sub-apertures' mean, of the aperture, and of its fades."""
+    """Values for the sub-apertures' mean, the aperture, and its fades."""
 
 
 def measure_scintillation(
-    flux: ArrayLike, frame_rate_hz: float, level: float = FADE_LEVEL, frame: ArrayLike | None = None
+    flux: ArrayLike, frame_rate_hz: float, level: float = 0.5, frame: ArrayLike | None = None
 ) -> Scintillation:
     """Return scintillation indices without noise, how fast the light varies, and its fades.
 
@@ -235,11 +234,12 @@ def _fades(pieces: _Pieces, parts: Floats, rate_hz: float, level: float) -> list
     below = light < level
     begins = below & ~np.concatenate([[False], below[:-1]])
     counts = np.array([[b - a, below[a:b].sum(), begins[a:b].sum()] for a, b in pieces.pieces], float)
+
+    def unknown(remark: str) -> list[Measured]:
+        return [Measured(name, unit, remark=remark) for name, unit in zip(names, ("", "s"), strict=True)]
+
     if begins.sum() < _FEWEST_FADES:
-        return [
-            Measured(name, unit, remark=f"{begins.sum()} fades: too few")
-            for name, unit in zip(names, ("", "s"), strict=True)
-        ]
+        return unknown(f"{begins.sum()} fades: too few")
 
     def found(weights: Floats) -> Floats:
         frames, faded, fades = weights @ counts
@@ -247,9 +247,7 @@ def _fades(pieces: _Pieces, parts: Floats, rate_hz: float, level: float) -> list
 
     value, error = _jackknife(found)
     made = float((noisier < level).mean() - below.mean())  # by as much noise again
-    share, length = (
-        Measured(name, unit, remark="hidden by noise") for name, unit in zip(names, ("", "s"), strict=True)
-    )
+    share, length = unknown("hidden by noise")
     if abs(made) < _MOST_MADE * value[0]:
         spread = math.hypot(error[0], 0.5 * made)
         share = Measured(names[0], "", float(value[0]) - made, spread, is_positive=True)

@@ -173,7 +173,7 @@ def best_fit(
         explained = fit.explained
         if explained > 0 and score * np.count_nonzero(fit.illuminated.nodes) < _PAIRS:
             continue
-        if explained > _CERTAIN and score > _SUFFICIENT * highest:
+        if explained > _CERTAIN:
             best = fit
             break
         rank = score * min(1.0, explained / _LITTLE)

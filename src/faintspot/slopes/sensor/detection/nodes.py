@@ -259,17 +259,17 @@ def spot_width(image: SpotImage, lattice: Lattice, nodes: NDArray[np.complex128]
     """
     widest = max(1.2, _BROADEST * lattice.pitch_px)
     widths = np.geomspace(_SHARPEST_PX, widest, _WIDTHS)
-    all_nodes = lattice.positions(lattice.cells_inside(image.shape, _MARGIN * lattice.pitch_px))
+    every, at = nodes is None, nodes
+    if at is None:
+        at = lattice.positions(lattice.cells_inside(image.shape, _MARGIN * lattice.pitch_px))
     offsets = _cell_offsets(lattice)
     best = (-np.inf, float(widths[0]))
     for start in _STARTS:
         start_px = _SHARPEST_PX * _RUNG ** round(np.log(widths[start] / _SHARPEST_PX) / np.log(_RUNG))
         band = image.band(lattice, start_px)
-        peaks, heights = _peaks(band, lattice, all_nodes if nodes is None else nodes)
-        certain = np.flatnonzero(heights >= _CERTAIN * _noise(band, lattice))
-        if nodes is not None:
-            certain = np.arange(len(nodes))
-        elif len(certain) < 4:
+        peaks, heights = _peaks(band, lattice, at)
+        certain = np.flatnonzero(heights >= _CERTAIN * _noise(band, lattice)) if every else np.arange(len(at))
+        if every and len(certain) < 4:
             continue
         chosen = certain[:: -(-len(certain) // _MOST_FOR_WIDTH)]
         values = _around(image.pixels, peaks[chosen], offsets)
