@@ -30,15 +30,14 @@ def command(slopes: tuple[str, ...], output: str | None, recording: tuple[str, .
     maps of flux, validity and jitter, slope arrows and the wavefront, in one file without any links outside.
 
     The store of a study (`faintspot study`), finished or not, gives the page with its figures and verdicts.
-    So does the folder of a closed-loop experiment (`faintspot loop`). Telemetry (`faintspot realtime record`)
-    gives rates, latencies, lost frames, slopes, changed settings, and differences between methods.
+    So does the folder of a closed-loop experiment (`faintspot loop`). Recordings of the engine have a page of
+    `faintspot telemetry`.
 
     \b
     Examples:
       faintspot report slopes.zarr
       faintspot report slopes.zarr plain.zarr -o comparison.html
       faintspot report paper.zarr
-      faintspot report night.zarr
       faintspot report canary -o canary.html
     """
     paths = [Path(path) for path in slopes]
@@ -58,9 +57,7 @@ def command(slopes: tuple[str, ...], output: str | None, recording: tuple[str, .
 
         report = report_of_study(paths[0])
     elif len(paths) == 1 and holds_telemetry(paths[0]):
-        from faintspot.engine.telemetry.page import report_of_telemetry
-
-        report = report_of_telemetry(paths[0])
+        raise InputError(f"{paths[0]}: expected slopes, got telemetry; use faintspot telemetry {paths[0]}")
     else:
         from faintspot.slopes.recorded.stored import report_of_stored
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -13,12 +14,13 @@ from faintspot.base.files import derived, write_atomically
 from faintspot.base.text_files import to_json
 from faintspot.cli.commands import SectionedCommand, declared, needs, option
 from faintspot.cli.output import progress_bar
+from faintspot.io.zarr_store import holds_telemetry
 from faintspot.slopes.sensor.layout import OPTICS, Layout
 
 if TYPE_CHECKING:
+    from faintspot.base.report.page import Report
     from faintspot.loop.control.identification.learnt_loop import ObservedLoop
     from faintspot.loop.control.identification.recording import Recording
-    from faintspot.loop.telemetry.page import Piece
     from faintspot.loop.telemetry.report import LoopReport
 
 _LACKS = "What FILE lacks"
@@ -104,7 +106,8 @@ def command(
     file, a SPARTA table of ESO with its matrices beside it, a .sav file of Keck, cubes of milk's logger, a
     session of pyRTC, a folder of arrays, a file with slopes, or a TOML file that names arrays. Writes a page
     and, beside it, the same numbers as JSON. Every value has a 95 % interval. Of a loop it replays other
-    gains and the predictive filter on the recorded turbulence. Takes a minute.
+    gains and the predictive filter on the recorded turbulence. Recordings of the engine also show latencies,
+    flags, slopes, wavefront and changes of settings. Takes a minute.
 
     Where methods alternated in a closed loop (realtime run --interleave), it compares them instead: Strehl
     ratio and residual phase, with hours of observing that would decide.
@@ -134,28 +137,46 @@ def command(
     loop = read_recorded_loop(recording, system, config, given)
     if controller is not None and not loop.is_closed:
         raise InputError("--controller: expected the recording of a closed loop, got an open one")
-    report = _report_loop(loop, page, [] if every is None else _over_time(loop, every), fade_level)
+    report = _report_loop(loop, recording, page, every, fade_level)
     if controller is not None:
         _learn(loop, report.observed, controller)
 
 
-def _report_loop(loop: Recording, page: Path, pieces: list[Piece], fade_level: float) -> LoopReport:
-    """Write the page and the numbers of a loop."""
-    from faintspot.loop.telemetry.page import page_of_loop, table_of_pieces
+def _report_loop(
+    loop: Recording, recording: Path, target: Path, every_s: float | None, fade_level: float
+) -> LoopReport:
+    """Write the page and the numbers of a loop, and the turbulence of its pieces."""
+    from faintspot.loop.telemetry.page import page_of_loop, table_of_pieces, turbulence_over_time
     from faintspot.loop.telemetry.report import report_of_loop
 
+    pieces = []
+    if every_s is not None:
+        with progress_bar("pieces", "pieces") as advance:
+            pieces = turbulence_over_time(loop, every_s, advance)
     report = report_of_loop(loop, lambda step: click.echo(f"{step} ...", err=True), fade_level=fade_level)
-    numbers = derived(page, ".json")
-    write_atomically(numbers, to_json(report.as_values(), indent=1))
-    page_of_loop(report, pieces).write(page)
     if pieces:
-        table = derived(page, "-over-time.csv")
+        table = derived(target, "-over-time.csv")
         write_atomically(table, table_of_pieces(pieces))
         click.echo(table)
-    for line in filter(None, dict.fromkeys((*report.loop.remarks, *report.doubts, report.advice))):
-        click.echo(line)
-    click.echo(f"{page}: open it in a browser; {numbers} has the numbers")
+    remarks = filter(None, dict.fromkeys((*report.loop.remarks, *report.doubts, report.advice)))
+    _write(recording, target, page_of_loop(report, pieces), report.as_values(), remarks)
     return report
+
+
+def _write(
+    recording: Path, target: Path, page: Report, values: dict[str, object], remarks: Iterable[str]
+) -> None:
+    """Write a page, with the sections that only recordings of the engine have, and its numbers."""
+    numbers = derived(target, ".json")
+    write_atomically(numbers, to_json(values, indent=1))
+    if holds_telemetry(recording):
+        from faintspot.loop.telemetry.engine_sections import with_engine
+
+        page = with_engine(page, recording)
+    page.write(target)
+    for line in remarks:
+        click.echo(line)
+    click.echo(f"{target}: open it in a browser; {numbers} has the numbers")
 
 
 def _learn(loop: Recording, observed: ObservedLoop | None, controller: str) -> None:
@@ -171,9 +192,7 @@ def _learn(loop: Recording, observed: ObservedLoop | None, controller: str) -> N
 
 def _alternates(recording: Path) -> bool:
     """Return whether a recording is of methods that alternated in a closed loop."""
-    from faintspot.io.zarr_store import holds_telemetry
-
-    if not (recording.is_dir() and holds_telemetry(recording)):
+    if not holds_telemetry(recording):
         return False
     from faintspot.experiments.night.recorded import alternates
 
@@ -182,35 +201,19 @@ def _alternates(recording: Path) -> bool:
 
 def _report_night(
     recording: Path,
-    page: Path,
+    target: Path,
     config: str | None,
     system: str | None,
     strehl: str | None,
     settle: int | None,
 ) -> None:
     """Write the page and the numbers of methods that alternated."""
-    from faintspot.experiments.night.recorded import (
-        page_of_recording,
-        recorded_night,
-        summary_of_recording,
-        text_of_recording,
-    )
+    from faintspot.experiments.night import recorded
     from faintspot.experiments.night.recorded_methods import read_strehl
 
     measured = None if strehl is None else read_strehl(strehl)
-    night = recorded_night(
+    night = recorded.recorded_night(
         recording, configuration=config, system=system, strehl=measured, settle_frames=settle
     )
-    numbers = derived(page, ".json")
-    write_atomically(numbers, to_json(summary_of_recording(night), indent=1))
-    page_of_recording(night).write(page)
-    click.echo(text_of_recording(night))
-    click.echo(f"{page}: open it in a browser; {numbers} has the numbers")
-
-
-def _over_time(loop: Recording, every_s: float) -> list[Piece]:
-    """Measure the turbulence of pieces of a recording, with a progress bar."""
-    from faintspot.loop.telemetry.page import turbulence_over_time
-
-    with progress_bar("pieces", "pieces") as advance:
-        return turbulence_over_time(loop, every_s, advance)
+    page, values = recorded.page_of_recording(night), recorded.summary_of_recording(night)
+    _write(recording, target, page, values, [recorded.text_of_recording(night)])

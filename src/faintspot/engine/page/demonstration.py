@@ -21,7 +21,6 @@ from faintspot.engine.processes.requests import TELESCOPE, ControlServer, reques
 from faintspot.engine.request_handlers import while_starting
 from faintspot.engine.settings.interleaving import short_names
 from faintspot.engine.streams.stream import Follower
-from faintspot.engine.telemetry.numbers import MethodDifference, compared_methods
 from faintspot.engine.telemetry.ring import TelemetryRing
 from faintspot.engine.telescope import TRUTH
 from faintspot.loop.control.base import KALMAN
@@ -29,6 +28,7 @@ from faintspot.loop.control.configuration import save_control
 from faintspot.loop.control.options import TABLE
 from faintspot.loop.simulation.configuration import LoopConfiguration, load_loop
 from faintspot.loop.simulation.engine_files import CONFIGURATION, fixed_window, write_engine_files
+from faintspot.loop.telemetry.turns import MethodDifference, compared_methods
 from faintspot.slopes.pipeline.configuration import Configuration, save
 from faintspot.slopes.pipeline.settings import Settings
 

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from faintspot.base.arrays import Floats
 from faintspot.base.flags import INVALID, SubapertureFlag, are_valid
 from faintspot.engine.settings.interleaving import methods_after, short_names
-from faintspot.engine.telemetry.numbers import MethodDifference, compared_methods
 from faintspot.io.telemetry import all_left_out
+from faintspot.loop.telemetry.turns import MethodDifference, compared_methods
 from faintspot.slopes.sensor.layout import Layout
 
 

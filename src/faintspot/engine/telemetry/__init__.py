@@ -1,1 +1,1 @@
-"""Telemetry of an engine: `ring` (shared memory), `recorder`, `numbers` and the report (`page`)."""
+"""Telemetry of an engine: `ring` (shared memory) and `recorder`."""

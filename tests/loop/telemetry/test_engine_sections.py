@@ -1,26 +1,20 @@
-"""The page of recorded telemetry, from a store whose lost frames and differences are known."""
+"""Sections of a recording of the engine, from a store whose differences are known."""
 
 from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
 import pytest
+from tests.cli.cli_cases import Commands
 from tests.patience import mostly_slow
 from tests.slopes.recorded.recorded_cases import Page
 
-from faintspot.base.errors import InputError
-from faintspot.engine.telemetry.numbers import (
-    change_rows,
-    compared_methods,
-    gaps,
-    method_names,
-    quantities,
-    timing,
-)
-from faintspot.engine.telemetry.page import latency_figure, report_of_telemetry
+from faintspot.base.report.page import Report
 from faintspot.engine.telemetry.recorder import TelemetryStore
 from faintspot.engine.telemetry.ring import image_type, layout_values, record_type
 from faintspot.io.telemetry import Telemetry, read_telemetry
+from faintspot.loop.telemetry.engine_sections import latency_figure, quantities, with_engine
+from faintspot.loop.telemetry.turns import compared_methods
 from faintspot.slopes.sensor.layout import Layout
 
 LAYOUT = Layout.grid((4, 4), pixels=8)
@@ -67,19 +61,10 @@ def night(path: Path) -> Telemetry:
     return read_telemetry(path)
 
 
-def test_rates_and_lost_frames(night: Telemetry) -> None:
-    assert timing(night) == pytest.approx((1000, 1e-3))
-    assert gaps(night).tolist() == [12]
-    frame, time_s, *words = change_rows(night)[0]
-    assert (frame, *words) == (510, "noise_std = 2.5", "1, 2")
-    assert time_s == pytest.approx(0.5)
-    assert len(change_rows(night)) == 1
-
-
 def test_methods_in_turn_differ_as_they_were_made(night: Telemetry) -> None:
-    values, names = quantities(night), method_names(night)
+    values = quantities(night)
     rms, flux = (
-        compared_methods(night.method, names, values[name])
+        compared_methods(night.method, ("none", "tv"), values[name])
         for name in ("rms of slopes about their mean (px)", "flux (e-)")
     )
     assert [method.method for method in rms] == ["none", "tv"]
@@ -96,22 +81,16 @@ def test_methods_in_turn_differ_as_they_were_made(night: Telemetry) -> None:
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("undrawn_pictures")
-def test_the_page_has_every_part_and_the_numbers_of_each_method(path: Path) -> None:
+def test_the_page_has_every_part_and_the_numbers_of_each_method(path: Path, run: Commands) -> None:
     """The methods have 0.20 and 0.16 px of noise; together they would have 0.18."""
-    page = Page(report_of_telemetry(path))
-    assert page.ids[:3] == ["timing", "methods", "changes"]
-    assert {"numbers", "flux", "slopes", "wavefront", "configuration"} <= set(page.ids)
-    assert "frame" not in page.ids
-    for words in (
-        "1000 frames a second",
-        "noise_std = 2.5",
-        "12 frames (0.6 %) are not in the record",
-        "bench",
-    ):
+    page = Page(with_engine(Report("", {}, []), path))
+    assert page.ids == ["engine", "numbers", "flux", "slopes", "wavefront", "configuration"]
+    for words in ("50.0", "noise_std = 2.5", "3 frames were overwritten", "Engine bench", "less 'none'"):
         assert words in page.text
     numbers = page.text[page.text.index("method noise (px)") :]
     noise = [float(numbers.split(f" {name} ", 1)[1].split()[0]) for name in ("none", "tv")]
     assert noise == pytest.approx([RMS_PX[0], RMS_PX[1]], rel=0.05)
+    run.refused("report", str(path), naming=("faintspot telemetry",))
 
 
 @pytest.mark.parametrize("n_frames", mostly_slow(1, [1, 7, 99]))
@@ -123,10 +102,3 @@ def test_latencies_of_a_short_record_are_drawn(path: Path, n_frames: int) -> Non
     axes = latency_figure(Telemetry(**short)).figure.axes[1]
     assert all(np.size(line.get_xdata()) >= min(n_frames, 20) for line in axes.lines)
     assert all(line.get_marker() == "o" for line in axes.lines)
-
-
-def test_telemetry_without_frames_is_refused(tmp_path: Path) -> None:
-    kinds = record_type(N), image_type(LAYOUT.frame_shape, N, LAYOUT.window)
-    TelemetryStore(tmp_path / "empty.zarr", *kinds, {"layout": layout_values(LAYOUT)})
-    with pytest.raises(InputError, match="no frame is recorded yet"):
-        report_of_telemetry(tmp_path / "empty.zarr")
