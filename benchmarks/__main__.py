@@ -56,6 +56,7 @@ _FOLDERS = {
         "pyrtc",
         "pyrtc_loop",
         "darc",
+        "streams",
         "startup",
     ),
     "": ("yardstick", "loaded"),
@@ -83,6 +84,7 @@ LONG = {
     "small_arrays",
     "backgrounds",
     "spot_widths",
+    "streams",
     "yardstick",
 }
 """Run only when named, or with --full: 5 minutes to an hour each, one with a recording of its own."""

@@ -56,11 +56,11 @@ typedef struct {
     char path[4096];
 } stream;
 
-static size_t item(uint8_t type) { return type == UINT16 ? 2 : 4; }
-static size_t whole(size_t bytes) { return (bytes + 7) / 8 * 8; }
+static inline size_t item(uint8_t type) { return type == UINT16 ? 2 : 4; }
+static inline size_t whole(size_t bytes) { return (bytes + 7) / 8 * 8; }
 
 /* Set where the parts of a stream are, from the beginning of its memory; return its bytes. */
-static size_t stream_parts(stream *s, const stream_head *h, char *memory) {
+static inline size_t stream_parts(stream *s, const stream_head *h, char *memory) {
     size_t data = h->elements * item(h->type), list = whole(4 * (size_t)h->semaphores);
     s->head = (void *)memory;
     s->values = memory + sizeof *h;
@@ -73,9 +73,9 @@ static size_t stream_parts(stream *s, const stream_head *h, char *memory) {
     return (char *)s->readers + 4 * list + 64 * h->traces + 48 * (size_t)h->buffered + whole(data * h->buffered) - memory;
 }
 
-static int is_alive(pid_t process) { return process > 0 && (!kill(process, 0) || errno == EPERM); }
+static inline int is_alive(pid_t process) { return process > 0 && (!kill(process, 0) || errno == EPERM); }
 
-static const char *stream_path(stream *s, const char *name) {
+static inline const char *stream_path(stream *s, const char *name) {
     const char *chosen = getenv("MILK_SHM_DIR"), *usual = access("/milk/shm", X_OK) ? "/tmp" : "/milk/shm";
     const char *folder = chosen && !access(chosen, X_OK) ? chosen : usual;
     if (!*name || strlen(name) > 79 || strchr(name, '/')) return "expected a name of up to 79 characters without /";
@@ -83,7 +83,7 @@ static const char *stream_path(stream *s, const char *name) {
 }
 
 /* Open a stream of uint16 or float32 that another program writes. */
-static const char *stream_open(stream *s, const char *name) {
+static inline const char *stream_open(stream *s, const char *name) {
     struct stat status;
     stream_head h;
     const char *error = stream_path(s, name);
@@ -103,7 +103,7 @@ static const char *stream_open(stream *s, const char *name) {
 }
 
 /* Create a stream with the keyword FRAME, unless a living process has one of that name. */
-static const char *stream_create(stream *s, const char *name, uint8_t type, uint32_t columns, uint32_t rows) {
+static inline const char *stream_create(stream *s, const char *name, uint8_t type, uint32_t columns, uint32_t rows) {
     char hidden[sizeof s->path + 16];
     struct stat status;
     const char *error = stream_path(s, name);
@@ -134,23 +134,23 @@ static const char *stream_create(stream *s, const char *name, uint8_t type, uint
 }
 
 /* Whether the stream's name still leads to it. */
-static int stream_is_same(const stream *s) {
+static inline int stream_is_same(const stream *s) {
     struct stat status;
     return !stat(s->path, &status) && status.st_ino == s->inode;
 }
 
 /* Take a semaphore that no living process waits on; give it back with stream_leave. */
-static int stream_join(stream *s) {
+static inline int stream_join(stream *s) {
     for (int k = 0; k < s->count && s->reads < 0; k++)
         if (!is_alive(s->readers[k])) s->readers[s->reads = k] = getpid();
     return s->reads >= 0;
 }
-static void stream_leave(stream *s) {
+static inline void stream_leave(stream *s) {
     if (s->reads >= 0) s->readers[s->reads] = 0;
 }
 
 /* Wait up to 0.1 s for a post, or until a signal; return whether there was one. */
-static int stream_wait(stream *s) {
+static inline int stream_wait(stream *s) {
     struct timespec end;
     clock_gettime(CLOCK_REALTIME, &end);
     end.tv_nsec += 100000000;
@@ -159,11 +159,11 @@ static int stream_wait(stream *s) {
 }
 
 /* Publish the values that are written between these two, with the number of their frame. */
-static void stream_begin(stream *s) {
+static inline void stream_begin(stream *s) {
     s->head->writing = 1;
     atomic_thread_fence(memory_order_seq_cst);
 }
-static void stream_publish(stream *s, int64_t frame) {
+static inline void stream_publish(stream *s, int64_t frame) {
     int value;
     s->keywords->value = frame;
     s->keywords->count++;
