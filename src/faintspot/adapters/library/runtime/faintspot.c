@@ -33,19 +33,18 @@ enum { FRAMES, CORNERS, SETTINGS, PRIOR, START, STOP, RESULT, RESULTS = 9, CHECK
 enum { ITEMS = 2, DATA = 4 }; /* of an array's cells: owner, parent, items, bytes of one, data, shape, strides */
 
 typedef struct { /* of one thread */
-    int64_t *cells, *images, *corners;
+    int64_t *cells, *images, *corners; /* cells of frames; of images, with their corners and results behind them */
     char *memory, *results[RESULTS];
 } worker;
 
 struct faintspot {
     variant v;
     faintspot_sensor sensor;
-    faintspot_slopes slopes;
+    union { faintspot_slopes slopes; char *results[RESULTS]; };
     kernel measure, check;
     char *bundle, *memory, **places; /* a copy of the bundle; arrays of this object; where each array is */
     const parameter *parameters;
     const int32_t *named, *last_rows;
-    char *results[RESULTS];
     float *settings, *prior;
     worker *workers;
     int threads;
@@ -53,12 +52,11 @@ struct faintspot {
 
 static const size_t ITEM[RESULTS] = {4, 4, 4, 1, 4, 4, 4, 4, 4};
 
-static void *aligned(size_t bytes) {
-    size_t whole = (bytes + 63) / 64 * 64 + 64;
-    void *memory = aligned_alloc(64, whole);
-    return memory ? memset(memory, 0, whole) : NULL;
-}
 static size_t rounded(size_t bytes) { return (bytes + 63) / 64 * 64; }
+static void *aligned(size_t bytes) {
+    void *memory = aligned_alloc(64, rounded(bytes) + 64);
+    return memory ? memset(memory, 0, rounded(bytes) + 64) : NULL;
+}
 
 static uint32_t checksum(const unsigned char *data, size_t size) { /* CRC-32 of zlib */
     uint32_t table[256], crc = 0xffffffffu;
@@ -104,35 +102,39 @@ static int is_whole(const header *h, const variant *v, const cell *cells, const 
 }
 
 static int is_sized(const variant *v, size_t size) {
-    const int32_t *counts = &v->width;
+    const int32_t *counts = &v->width, *lists = &v->parameters;
     for (int k = 0; k < 8; k++) /* width ... rows */
         if (counts[k] < 1 || counts[k] > MOST) return 0;
-    const int32_t lists[] = {v->parameters, v->cells, v->check_cells, v->arrays};
-    for (int k = 0; k < 4; k++)
+    for (int k = 0; k < 4; k++) /* parameters ... arrays */
         if (lists[k] < 0 || lists[k] > MOST_LISTED) return 0;
     size_t bytes = sizeof *v + ((size_t)v->cells + v->check_cells) * sizeof(cell) + v->arrays * sizeof(array) + v->parameters * sizeof(parameter) + 4 * ((size_t)NAMED + v->groups);
     return v->named == NAMED && v->groups == (v->n + v->width - 1) / v->width && bytes <= size;
 }
 
-static int prepare_images(faintspot *s, worker *w, int count) {
-    size_t n = s->v.n, bytes = 0;
-    if (!(w->images = aligned(count * sizeof(int64_t))) || !(w->corners = aligned(2 * n * sizeof(int64_t)))) return 0;
-    memcpy(w->images, w->cells, count * sizeof(int64_t));
+static int prepare_images(faintspot *s, worker *w, size_t count) {
+    size_t n = s->v.n, bytes = count * sizeof(int64_t), corners = 2 * n * sizeof(int64_t);
+    char *next = aligned(rounded(bytes) + rounded(corners) + RESULTS * rounded(4 * n));
+    if (!next) return 0;
+    w->images = memcpy(next, w->cells, bytes), next += rounded(bytes);
+    w->corners = (int64_t *)next, next += rounded(corners);
     w->images[s->named[CORNERS] + DATA] = (int64_t)w->corners;
-    for (int k = 0; k < RESULTS; bytes += rounded(n * ITEM[k]), k++)
-        if (!(w->results[k] = aligned(n * ITEM[k]))) return 0;
-        else w->images[s->named[RESULT + k] + DATA] = (int64_t)w->results[k];
+    for (int k = 0; k < RESULTS; k++, next += rounded(4 * n)) w->images[s->named[RESULT + k] + DATA] = (int64_t)(w->results[k] = next);
     return 1;
 }
 
-static int prepare(faintspot *s, worker *w, const cell *cells, const array *arrays) {
+/* Allocate the arrays of an owner, and set their places. */
+static char *placed(faintspot *s, const array *arrays, int owner) {
     size_t bytes = 0;
+    for (int k = 0; k < s->v.arrays; k++) bytes += arrays[k].owner == owner ? rounded(arrays[k].bytes) : 0;
+    char *memory = aligned(bytes), *next = memory;
+    for (int k = 0; memory && k < s->v.arrays; k++)
+        if (arrays[k].owner == owner) s->places[k] = next, next += rounded(arrays[k].bytes);
+    return memory;
+}
+
+static int prepare(faintspot *s, worker *w, const cell *cells, const array *arrays) {
     int count = s->v.cells + s->v.check_cells;
-    for (int k = 0; k < s->v.arrays; k++) bytes += arrays[k].owner == THREAD ? rounded(arrays[k].bytes) : 0;
-    if (!(w->memory = aligned(bytes)) || !(w->cells = aligned(count * sizeof(int64_t)))) return 0;
-    bytes = 0;
-    for (int k = 0; k < s->v.arrays; k++)
-        if (arrays[k].owner == THREAD) s->places[k] = w->memory + bytes, bytes += rounded(arrays[k].bytes);
+    if (!(w->memory = placed(s, arrays, THREAD)) || !(w->cells = aligned(count * sizeof(int64_t)))) return 0;
     for (int k = 0; k < count; k++) w->cells[k] = cells[k].is_pointer ? (int64_t)s->places[cells[k].value] : cells[k].value;
     return s->v.pixels != FAINTSPOT_IMAGES || prepare_images(s, w, count);
 }
@@ -145,47 +147,37 @@ static const char *fill(faintspot *s, const header *h, int64_t offset, int threa
     s->named = (const void *)(s->parameters + s->v.parameters);
     s->last_rows = s->named + NAMED;
     if (!is_whole(h, &s->v, cells, arrays, s->parameters, s->named)) return "the bundle is damaged: lists";
-    size_t bytes = 0;
-    for (int k = 0; k < s->v.arrays; k++) bytes += arrays[k].owner == INSTANCE ? rounded(arrays[k].bytes) : 0;
-    if (!(s->memory = aligned(bytes)) || !(s->places = calloc(s->v.arrays + 1, sizeof *s->places)) || !(s->workers = calloc(threads, sizeof *s->workers))) return "not enough memory";
-    bytes = 0;
+    if (!(s->places = calloc(s->v.arrays + 1, sizeof *s->places)) || !(s->memory = placed(s, arrays, INSTANCE)) || !(s->workers = calloc(threads, sizeof *s->workers))) return "not enough memory";
     for (int k = 0; k < s->v.arrays; k++) {
         char *content = arrays[k].offset < 0 ? NULL : s->bundle + h->pool + arrays[k].offset;
         if (arrays[k].owner == CONSTANT) s->places[k] = content ? content : s->memory;
-        if (arrays[k].owner != INSTANCE) continue;
-        s->places[k] = s->memory + bytes;
-        if (content) memcpy(s->places[k], content, arrays[k].bytes);
-        bytes += rounded(arrays[k].bytes);
+        if (arrays[k].owner == INSTANCE && content) memcpy(s->places[k], content, arrays[k].bytes);
     }
     s->threads = threads;
     for (int k = 0; k < threads; k++)
         if (!prepare(s, s->workers + k, cells, arrays)) return "not enough memory";
     const int64_t *first = s->workers[0].cells;
-    char **r = s->results;
-    for (int k = 0; k < RESULTS; k++) r[k] = (char *)first[s->named[RESULT + k] + DATA];
+    for (int k = 0; k < RESULTS; k++) s->results[k] = (char *)first[s->named[RESULT + k] + DATA];
     s->settings = (float *)first[s->named[SETTINGS] + DATA];
     s->prior = (float *)first[s->named[PRIOR] + DATA];
-    s->slopes = (faintspot_slopes){(void *)r[0], (void *)r[1], (void *)r[2], (void *)r[3], (void *)r[4], (void *)r[5], (void *)r[6], (void *)r[7], (void *)r[8]};
     return NULL;
 }
 
 static const char *choose(faintspot *s, const char *bundle, size_t size, int pixels, int threads) {
-    header h;
     int level = processor_level(), needs = 0, there = 0;
     if (threads < 1 || threads > 4096) return "threads: expected 1 to 4096";
-    if (size < sizeof h) return "the bundle is cut short";
-    memcpy(&h, bundle, sizeof h);
-    if (memcmp(h.magic, "FSPT", 4)) return "not a bundle of faintspot";
-    if (h.format != FORMAT) return "the bundle has another format than this library: export both again";
-    if (h.total != (int64_t)size) return "the bundle is cut short, or too long";
-    if (checksum((const unsigned char *)bundle + CHECKED_FROM, size - CHECKED_FROM) != h.checksum) return "the bundle is damaged: checksum";
-    if (h.variants < 0 || h.variants > 99 || h.pool < 0 || h.pool > h.total || h.version[23] || h.fingerprint[23]) return "the bundle is damaged: header";
-    if (sizeof h + h.variants * sizeof(entry) > size) return "the bundle is damaged: header";
+    if (size < sizeof(header)) return "the bundle is cut short";
     if (!(s->bundle = aligned(size))) return "not enough memory";
-    memcpy(s->bundle, bundle, size);
-    for (int k = 0; k < h.variants; k++) {
-        entry e = ((const entry *)(s->bundle + sizeof h))[k];
-        if (e.offset < 0 || e.size < (int64_t)sizeof s->v || e.offset % 8 || e.offset > h.pool || e.size > h.pool - e.offset) return "the bundle is damaged: variants";
+    const header *h = memcpy(s->bundle, bundle, size);
+    if (memcmp(h->magic, "FSPT", 4)) return "not a bundle of faintspot";
+    if (h->format != FORMAT) return "the bundle has another format than this library: export both again";
+    if (h->total != (int64_t)size) return "the bundle is cut short, or too long";
+    if (checksum((const unsigned char *)bundle + CHECKED_FROM, size - CHECKED_FROM) != h->checksum) return "the bundle is damaged: checksum";
+    if (h->variants < 0 || h->variants > 99 || h->pool < 0 || h->pool > h->total || h->version[23] || h->fingerprint[23]) return "the bundle is damaged: header";
+    if (sizeof *h + h->variants * sizeof(entry) > size) return "the bundle is damaged: header";
+    for (int k = 0; k < h->variants; k++) {
+        entry e = ((const entry *)(s->bundle + sizeof *h))[k];
+        if (e.offset < 0 || e.size < (int64_t)sizeof s->v || e.offset % 8 || e.offset > h->pool || e.size > h->pool - e.offset) return "the bundle is damaged: variants";
         memcpy(&s->v, s->bundle + e.offset, sizeof s->v);
         if (!is_sized(&s->v, e.size)) return "the bundle is damaged: sizes";
         if (s->v.pixels != pixels) continue;
@@ -194,9 +186,8 @@ static const char *choose(faintspot *s, const char *bundle, size_t size, int pix
         s->measure = kernel_of(s->v.measure, level, &needs);
         if (!s->measure || !s->check) continue;
         const variant *v = &s->v;
-        const header *kept = (const header *)s->bundle;
-        s->sensor = (faintspot_sensor){v->n, v->ny, v->nx, v->h, v->w, v->width, v->groups, pixels, needs == 4 ? "x86-64-v4" : needs == 3 ? "x86-64-v3" : needs ? "x86-64" : "aarch64", kept->version, kept->fingerprint};
-        return fill(s, &h, e.offset, threads);
+        s->sensor = (faintspot_sensor){v->n, v->ny, v->nx, v->h, v->w, v->width, v->groups, pixels, needs == 4 ? "x86-64-v4" : needs == 3 ? "x86-64-v3" : needs ? "x86-64" : "aarch64", h->version, h->fingerprint};
+        return fill(s, h, e.offset, threads);
     }
     return there ? "this library has no kernels for the bundle on this processor: export it into the library's folder" : "the bundle has no tables for these pixels";
 }
@@ -225,10 +216,8 @@ void faintspot_destroy(faintspot *s) {
     if (!s) return;
     for (int k = 0; k < s->threads; k++) {
         worker *w = s->workers + k;
-        for (int i = 0; i < RESULTS; i++) free(w->results[i]);
         free(w->cells);
         free(w->images);
-        free(w->corners);
         free(w->memory);
     }
     free(s->workers);
