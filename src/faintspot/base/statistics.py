@@ -20,6 +20,8 @@ DRAWS = 2000
 SEED = 20150611  # of the resampling: the same numbers give the same interval
 MAD_TO_STD = 1.4826
 """Standard deviation of a normal distribution in units of its median absolute deviation."""
+FWHM_TO_STD = 1.0 / (2.0 * math.sqrt(2.0 * math.log(2.0)))
+"""Standard deviation of a Gaussian of full width at half maximum 1."""
 _LEVEL = 0.95
 _NORMAL = 1.959964
 _WIDENING = 1.96  # standard errors on each side of an interval

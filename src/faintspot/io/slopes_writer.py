@@ -125,7 +125,7 @@ class SlopeWriter(Closing):
     ) -> None:
         self._path, self._run, self._lock, self._export, self._store = path, run, lock, export, store
         self._is_open = export is not None or store is not None
-        self._next_mark = 0.0
+        self._next_mark = 0.0  # an incomplete chunk that is written again has a new mark at once
         # One attribute, so that an interruption finds both parts of it changed or neither.
         self._state: tuple[int, list[dict[str, NDArray[Any]]]] = (0 if self._is_open else run.n_frames, [])
         if store is not None:

@@ -112,16 +112,13 @@ class SlopeStore:
         self.marked = finished
 
     def write(self, start: int, variables: Mapping[str, NDArray[np.generic]]) -> None:
-        """Store whole chunks; one that was incomplete is marked again as soon as it is written."""
-        again = self.marked > start
-        if again:
+        """Store whole chunks; the caller marks one that was incomplete as soon as it is written."""
+        if self.marked > start:
             self.mark(start)
         for name, values in variables.items():
             array = self._arrays[name]
             array[start : start + len(values)] = values
             self._not_synchronised.update(chunk_files(self.path, array, start, start + len(values)))
-        if again:
-            self.mark(start + len(variables["x"]))
 
     def variables(self) -> Any:
         """Return the variables, each read in parts from the store."""

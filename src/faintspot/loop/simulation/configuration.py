@@ -13,6 +13,7 @@ import numpy as np
 
 from faintspot.base.errors import InputError, errors_within
 from faintspot.base.files import check_size
+from faintspot.base.statistics import FWHM_TO_STD
 from faintspot.base.tables import ConfigurationTable, tables_as_text
 from faintspot.base.text_files import check_keys, check_known, checked_table, parse_file, parse_text
 from faintspot.loop.simulation import sections
@@ -323,4 +324,4 @@ def field_of_view(loop: LoopConfiguration) -> float:
 def blur_px(loop: LoopConfiguration) -> float:
     """Return the standard deviation along x of the source that elongates the spots, px."""
     width = SPOT_FWHM * loop.spot_width_px
-    return width * math.sqrt(loop.sensor.spot_elongation**2 - 1) / 2.3548
+    return width * math.sqrt(loop.sensor.spot_elongation**2 - 1) * FWHM_TO_STD

@@ -8,11 +8,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from faintspot.base.checks import image_stack, numbers_between, one_of
 from faintspot.base.errors import InputError
-from faintspot.base.statistics import MAD_TO_STD
+from faintspot.base.statistics import FWHM_TO_STD, MAD_TO_STD
 from faintspot.slopes.kernels.host import lanes_for
 from faintspot.slopes.kernels.parallel import run_groups
 from faintspot.slopes.kernels.positions.gravity import centroid_stack, subtract_stack
-from faintspot.slopes.spots.shapes import FWHM_TO_STD
 
 RULES = ("subtract_next", "threshold", "subtract_kth")
 

@@ -7,10 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.arrays import Floats
+from faintspot.base.statistics import FWHM_TO_STD
 from faintspot.slopes.kernels.positions.brightest import SMALLEST_VARIANCE
 from faintspot.slopes.kernels.positions.spot_rows import MARGIN, PHASES
 from faintspot.slopes.spots.psf import PSF
-from faintspot.slopes.spots.shapes import FWHM_TO_STD
 
 START_SMOOTHING = (
     0.73  # standard deviation of the smoothing in units of the spot's FWHM: about a matched filter

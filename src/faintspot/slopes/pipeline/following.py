@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from faintspot.base.checks import LARGEST_FLOAT32, real_array
 from faintspot.base.errors import InputError
 from faintspot.base.flags import UNMEASURED, SubapertureFlag, scaled_positions
-from faintspot.base.statistics import MAD_TO_STD
+from faintspot.base.statistics import FWHM_TO_STD, MAD_TO_STD
 from faintspot.slopes.camera.calibration import Calibration, binned
 from faintspot.slopes.estimators.base import Estimator
 from faintspot.slopes.kernels.validity.doubtful import doubtful_scratch_size, flag_doubtful
@@ -37,7 +37,6 @@ _OWN, _MOST_OWN = 0.5, 0.25
 _ENOUGH, _FEWEST, _WEIGHT, _FAR = 0.9, 0.5, 0.1, 0.4
 # Standard deviations above which the mean of the windows shows a common motion, and smaller ones [px].
 _CERTAIN, _SMALL_PX = 5.0, 1.5
-_FWHM_OF_STD = 2.355
 _LEAST_APART_PX = 1.5  # spots nearer to each other, or than their FWHM, cross
 
 
@@ -215,7 +214,7 @@ class SpotFollower:
         image = SpotImage(np.where(good, calibrated, np.median(calibrated[good])).astype(np.float64))
         if self._width_px is None:
             fwhm_px = self.pipeline.plan.typical_fwhm_px
-            self._width_px = spot_width(image, self._lattice) if fwhm_px is None else fwhm_px / _FWHM_OF_STD
+            self._width_px = spot_width(image, self._lattice) if fwhm_px is None else fwhm_px * FWHM_TO_STD
         spots = find_spots(image, self._lattice, self._width_px)
         nodes, shape = self._nodes, calibrated.shape
         acquired = acquire(spots, nodes, self._neighbours, self._pitch_px, shape, expected, bent=bent)
@@ -283,7 +282,7 @@ class SpotFollower:
 
     def _crossing(self, spots: Complex, used: NDArray[np.bool_] | None = None) -> NDArray[np.bool_]:
         """Return which of the used spots are so near to each other that they cannot be told apart."""
-        apart = max(_LEAST_APART_PX, _FWHM_OF_STD * (self._width_px or 0.0))
+        apart = max(_LEAST_APART_PX, (self._width_px or 0.0) / FWHM_TO_STD)
         index = np.arange(len(spots)) if used is None else np.flatnonzero(used)
         crossing = np.zeros(len(spots), bool)
         if len(index) > 1:

@@ -370,7 +370,7 @@ class SlopePipeline:
         if explain or prepared.in_python:
             stages = np.empty((STAGE_ROWS, n_frames, n, self.binned_layout.pixels), np.float32)
         predicted = None if prior is None else prior_slopes(prior, n_frames, self.layout) / np.float32(factor)
-        task = self.plan.task(self._variants(self.source(frames, dtype)), predicted)
+        task = self.plan.task(self._variants(frames, dtype), predicted)
         arguments = self.arguments(frames, dtype, task, stages=stages)
         kernel, results = self.plan.kernel, arguments.slopes
 
@@ -462,11 +462,12 @@ class SlopePipeline:
         corners, window = self.binned_layout.corners, self.binned_layout.window
         return Source(self._lanes, Frames.of(frames), corners, *window, self._calibration, saturation)
 
-    def _variants(self, source: Source) -> NDArray[np.int64]:
+    def _variants(self, frames: NDArray[Any], dtype: DTypeLike) -> NDArray[np.int64]:
         """Return the index of the settings table of each frame, by its flux if settings depend on it."""
-        n_frames, n = len(source.frames.array), len(self.layout)
+        n_frames, n = len(frames), len(self.layout)
         if not self.needs_flux:
             return np.zeros(n_frames, np.int64)
+        source = self.source(frames, dtype)
         flux, flux_kernel = np.empty((n_frames, n), np.float32), self.plan.flux_kernel
 
         def job(start: int, stop: int, scratch: Scratch) -> None:

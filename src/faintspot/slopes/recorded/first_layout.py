@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from faintspot.base.arrays import Floats
 from faintspot.base.errors import InputError, errors_within
-from faintspot.base.statistics import MAD_TO_STD
+from faintspot.base.statistics import FWHM_TO_STD, MAD_TO_STD
 from faintspot.base.tables import Tables
 from faintspot.io.frames import FrameSource, open_frames
 from faintspot.slopes.camera.calibration import Calibration, binned, read_map
@@ -43,7 +43,6 @@ from faintspot.slopes.sensor.found_layout import FoundLayout, KnownGrid, find_gr
 from faintspot.slopes.sensor.layout import OPTICS, Layout
 from faintspot.slopes.sensor.region import neighbour_vectors
 from faintspot.slopes.sensor.window_checks import LARGEST_WINDOW, window_size
-from faintspot.slopes.spots.shapes import FWHM_TO_STD
 
 _MOST_FRAMES = 200  # averaged to find the spots
 _FIRST_FRAMES = 20  # measured for the settings

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from faintspot.base.arrays import Floats
 from faintspot.base.errors import InputError
+from faintspot.base.statistics import FWHM_TO_STD
 from faintspot.slopes.camera.calibration import Calibration, binned, binned_calibration
 from faintspot.slopes.estimators.base import Need
 from faintspot.slopes.estimators.centroid import SeenSpots, like_most, seen_spots
@@ -21,7 +22,6 @@ from faintspot.slopes.sensor.layout import Layout
 from faintspot.slopes.sensor.region import neighbour_vectors, neighbours_of
 from faintspot.slopes.sensor.window_checks import LARGEST_WINDOW
 from faintspot.slopes.spots.psf import PSF
-from faintspot.slopes.spots.shapes import FWHM_TO_STD
 
 _FEWEST_PX = 4  # of a window's side; below, as in quad cells, every pixel counts
 _WIDTH_OF_WINDOW = 0.25  # of the window's side, where no spot is seen

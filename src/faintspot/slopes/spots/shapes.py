@@ -20,9 +20,6 @@ SMALLEST_SIZE = 0.05
 FWHM_OF_SIZE_1_PX = {"diffraction": 1.772, "gaussian": 2.0}
 """Full width at half maximum of the optical spot of size 1, by profile."""
 
-FWHM_TO_STD = 1.0 / (2.0 * math.sqrt(2.0 * math.log(2.0)))
-"""Standard deviation of a Gaussian of full width at half maximum 1."""
-
 _BLOCK_PIXELS = 1 << 15  # pixels processed at a time: the temporary arrays stay in the cache
 _RIGHT_ANGLE_TOLERANCE_DEG = 1e-9
 

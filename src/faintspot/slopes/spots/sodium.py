@@ -12,7 +12,7 @@ from faintspot.base.arrays import Floats
 from faintspot.base.checks import number_between, numbers_between
 from faintspot.base.errors import InputError
 from faintspot.base.files import NpzFile
-from faintspot.slopes.spots.shapes import FWHM_TO_STD
+from faintspot.base.statistics import FWHM_TO_STD
 
 _HIGHEST_M = 1e6
 _MOST_BINS = 4096

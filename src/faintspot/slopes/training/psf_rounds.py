@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from faintspot.base.arrays import Floats
 from faintspot.base.errors import InputError
 from faintspot.base.flags import KEEPABLE, SubapertureFlag, leave_out
+from faintspot.base.statistics import FWHM_TO_STD
 from faintspot.slopes.camera.calibration import Calibration
 from faintspot.slopes.camera.frame_checks import MeanFrame
 from faintspot.slopes.pipeline.light import MeanLight
@@ -56,7 +57,7 @@ class LearningOptions:
 
 def gaussian_psf(fwhm_px: float, options: LearningOptions) -> PSF:
     """Return a round Gaussian PSF, pixels included."""
-    std = np.hypot(fwhm_px / 2.3548, 1 / np.sqrt(12))
+    std = np.hypot(fwhm_px * FWHM_TO_STD, 1 / np.sqrt(12))
     reach = options.radius_px * options.oversampling
     profile = np.exp(-0.5 * (np.arange(-reach, reach + 1) / options.oversampling / std) ** 2)
     return PSF(np.outer(profile, profile), options.oversampling)
@@ -67,7 +68,7 @@ def measured_width(stack: Stack) -> float:
     images = stack.images[:: max(1, len(stack.images) // _START_SPOTS)]
 
     def response(fwhm_px: float) -> float:
-        std = fwhm_px / 2.3548
+        std = fwhm_px * FWHM_TO_STD
         peaks = scipy.ndimage.gaussian_filter(images, std, mode="constant", axes=(1, 2)).max(axis=(1, 2))
         return std * float(peaks.mean())  # a kernel of unit energy: the noise is the same at all widths
 

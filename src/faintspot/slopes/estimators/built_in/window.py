@@ -15,6 +15,7 @@ from faintspot.base.arrays import Floats
 from faintspot.base.checks import not_none
 from faintspot.base.errors import InputError
 from faintspot.base.options import Value, option
+from faintspot.base.statistics import FWHM_TO_STD
 from faintspot.slopes.estimators.base import Estimator, EstimatorPlan, Need, Style
 from faintspot.slopes.estimators.registry import register
 from faintspot.slopes.estimators.sensor import Scene, Sensor
@@ -23,7 +24,6 @@ from faintspot.slopes.kernels.groups import RANGE
 from faintspot.slopes.kernels.host import WIDTHS, lanes_for
 from faintspot.slopes.kernels.positions import window
 from faintspot.slopes.spots.fixed_weights import FixedWeights
-from faintspot.slopes.spots.shapes import FWHM_TO_STD
 
 _WIDTHS = (1.25, 0.8, 1.0, 1.6, 2.0, 2.8)  # multiples of the spot's width
 _WIDTHS_OF_SPECKLES = (2.0, 1.0, 1.25, 1.6, 2.8, 4.0)

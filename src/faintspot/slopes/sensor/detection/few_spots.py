@@ -13,7 +13,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from faintspot.base.statistics import MAD_TO_STD
+from faintspot.base.statistics import FWHM_TO_STD, MAD_TO_STD
 from faintspot.slopes.sensor.detection.candidates import RATIOS, Lattice, robust_std
 from faintspot.slopes.sensor.detection.fits import DIM, FEWEST, MOST, LatticeFit, pitch_doubt
 from faintspot.slopes.sensor.detection.illumination import FAINT, Illumination, illumination_doubt
@@ -48,7 +48,6 @@ _ANGLE_DEG, _PITCH = 8.0, 1.2  # tolerances of what is stated
 _SINGLE = 5.0  # pitch of a single spot, in its FWHM
 _NOISY = 0.007  # relative error of the pitch
 _QUARTERS = 0.5  # FWHM in pitches from which on four spots may be parts of one
-_FWHM = 2.3548
 
 
 @dataclass(frozen=True)
@@ -156,7 +155,7 @@ def _best_match(peaks: _Peaks, stated: Stated) -> _Match | None:
     worth = np.where(peaks.bright, peaks.evidence * (1.0 + clear), 0.0)[:_MOST_PEAKS]
     best: _Match | None = None
     if stated.grid in (None, (1, 1)):
-        side = _SINGLE * _FWHM * peaks.width_px
+        side = _SINGLE * peaks.width_px / FWHM_TO_STD
         lattice = Lattice("square", complex(at[0]), complex(side))
         best = _Match(float(worth[0]) - elsewhere, lattice, at[:1], peaks)
     for geometry in stated.geometries:
@@ -271,7 +270,8 @@ def _measured(image: SpotImage, match: _Match, stated: Stated) -> LatticeFit | N
             break
         if single:
             edge = np.array(image.shape[::-1]) - 1 - as_rows(at)[0]
-            side = min(_SINGLE * _FWHM * width_px, 2 * float(np.minimum(as_rows(at)[0], edge).min()) + 1)
+            inside = 2 * float(np.minimum(as_rows(at)[0], edge).min()) + 1
+            side = min(_SINGLE * width_px / FWHM_TO_STD, inside)
             lattice, nodes = replace(lattice, origin=complex(at[0]), step=complex(max(side, 3.0))), at
         else:
             lattice = lattice.fitted(cells, at)
@@ -295,7 +295,7 @@ def _doubt(fit: LatticeFit, size: NDArray[np.int64], stated: Stated, *, hides: b
     """Return why the array may be another one, in one line; empty if it is clear."""
     spots, lit, array = fit.spots, fit.illuminated.nodes, f"{size[0]} x {size[1]}"
     known, empty = stated.grid is not None, size.prod() - fit.lit
-    ratio, fwhm = spots.signal_to_noise[lit], _FWHM * fit.width_px / fit.lattice.pitch_px
+    ratio, fwhm = spots.signal_to_noise[lit], fit.width_px / FWHM_TO_STD / fit.lattice.pitch_px
     doubts = []
     if len(fit.elsewhere):
         doubts.append(
