@@ -1,4 +1,8 @@
-"""Header-and-data units of FITS files, read without their data; columns of binary tables; images written."""
+"""Header-and-data units of FITS files, read without their data; columns of binary tables; images written.
+
+Parts are not read by `section` of astropy: columns have none, it does not read gzip up to the checksum, and it
+leaves BLANK aside in unsigned integers.
+"""
 
 from __future__ import annotations
 

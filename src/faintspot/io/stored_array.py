@@ -1,4 +1,7 @@
-"""An array in a file: its location, opened for the first read and read in parts; its axes, equal colours."""
+"""An array in a file: its location, opened for the first read and read in parts; its axes, equal colours.
+
+xarray reads few of the formats, and states no sizes of chunks before they are read.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Zarr stores on the disk, and sizes of compressed chunks, found before a library makes room for them."""
+"""Zarr stores on the disk, and sizes of compressed chunks, found before a library makes room for them.
+
+zarr alone inflates chunks of any size, takes a lost chunk for its fill value and does not wait for the disk.
+"""
 
 import bz2
 import itertools
