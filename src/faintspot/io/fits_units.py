@@ -1,7 +1,7 @@
 """Header-and-data units of FITS files, read without their data; columns of binary tables; images written.
 
-Parts are not read by `section` of astropy: columns have none, it does not read gzip up to the checksum, and it
-leaves BLANK aside in unsigned integers.
+Parts are not read by `section` of astropy: columns have none, gzip is not read up to its checksum, and BLANK
+is left aside in unsigned integers.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Writer of slopes: chunk by chunk into a Zarr store with marks of progress, or from memory.
 
-`to_zarr` of xarray appends without waiting for the disk, so that a kill could lose frames that the store states.
+`to_zarr` of xarray appends without waiting for the disk: a kill could lose frames that the store states.
 """
 
 import contextlib
