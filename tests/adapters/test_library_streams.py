@@ -18,7 +18,7 @@ from tests.patience import LIMIT_S, wait_for
 import faintspot as fs
 from faintspot.adapters.library.folder import ExportedLibrary
 from faintspot.adapters.library.objects import TARGETS, native_target
-from faintspot.engine.streams.image_layout import METADATA, SEMAPHORES, places_of
+from faintspot.engine.streams.image_layout import METADATA, SEMAPHORES, path_of, places_of
 from faintspot.engine.streams.image_stream import ImageStream, ImageStreamWriter
 
 pytestmark = [
@@ -60,8 +60,7 @@ def started(*command: object) -> Iterator[tuple[subprocess.Popen[str], ImageStre
     pipes: dict[str, Any] = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
     with subprocess.Popen([str(part) for part in command], **pipes) as process:
         try:
-            there = Path(ImageStreamWriter("probe", (1,)).path).with_name("slopes.im.shm")
-            wait_for(lambda: there.exists() or process.poll() is not None, process.communicate)
+            wait_for(lambda: path_of("slopes").exists() or process.poll() is not None, process.communicate)
             yield process, ImageStream("slopes")
         finally:
             process.kill()
