@@ -33,6 +33,22 @@ _SMALLEST, _LARGEST, _NODES = 1e-6, 1e3, 2000  # separations of the table in out
 _DIRECTIONS = 8
 _POINTS = 6  # of the quadrature along half an edge
 
+Cells = NDArray[np.int64]
+
+_FITS = 0.7
+"""Least `smoothness` of a right order: of mirrors of OOPAO, HCIPy, SPECULA and soapy .92 to .98; of wrong
+orders 0 to .3, of two pairs of lenslets exchanged .6 to .8. With few polynomials as modes right orders have
+.86, wrong ones up to .65."""
+_WRONG = 0.4  # below which nothing is learnt
+_MOST_SUBAPERTURES, _FEWEST_SUBAPERTURES = 60, 9
+_FEWEST_MODES = 5  # without tip and tilt: fewer need not be those with the most turbulence
+_OF_NOISE = 3.0  # times the noise's, for modes of turbulence
+_OF_TURBULENCE = 0.5, 0.25
+"""Like `_FITS` and `_WRONG`, of modes of 500 frames of turbulence: right orders .57 to .79, shuffled ones
+up to .05, with axes exchanged .09 to .4, with rows upwards .25 to .38."""
+_LEAST = 1e-3  # of the largest singular value, that counts as a mode of the mirror
+_OUTER_SCALE = 40.0  # sub-apertures
+
 
 @dataclass(frozen=True, eq=False)
 class SlopeTurbulence:
@@ -243,23 +259,6 @@ def _both_axes(along: Floats, across: Floats, side: float, structure: _Structure
                     square = square + (across + edge_y * side / 2 - on_y) ** 2
                     total -= 0.5 * edge_x * edge_y * weight_x * weight_y * structure(square)
     return total / side**2
-
-
-Cells = NDArray[np.int64]
-
-_FITS = 0.7
-"""Least `smoothness` of a right order: of mirrors of OOPAO, HCIPy, SPECULA and soapy .92 to .98; of wrong
-orders 0 to .3, of two pairs of lenslets exchanged .6 to .8. With few polynomials as modes right orders have
-.86, wrong ones up to .65."""
-_WRONG = 0.4  # below which nothing is learnt
-_MOST_SUBAPERTURES, _FEWEST_SUBAPERTURES = 60, 9
-_FEWEST_MODES = 5  # without tip and tilt: fewer need not be those with the most turbulence
-_OF_NOISE = 3.0  # times the noise's, for modes of turbulence
-_OF_TURBULENCE = 0.5, 0.25
-"""Like `_FITS` and `_WRONG`, of modes of 500 frames of turbulence: right orders .57 to .79, shuffled ones
-up to .05, with axes exchanged .09 to .4, with rows upwards .25 to .38."""
-_LEAST = 1e-3  # of the largest singular value, that counts as a mode of the mirror
-_OUTER_SCALE = 40.0  # sub-apertures
 
 
 def modes_of_turbulence(slopes: Floats) -> Floats:

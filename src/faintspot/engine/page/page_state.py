@@ -15,6 +15,28 @@ from faintspot.io.telemetry import all_left_out
 from faintspot.loop.telemetry.turns import MethodDifference, compared_methods
 from faintspot.slopes.sensor.layout import Layout
 
+STRIP_S = 30.0
+"""Time span of the strip charts [s]."""
+FRAMES_S = 60.0
+"""Time span of percentiles, the histogram and the comparison of methods [s]."""
+_MOST_FRAMES = 1 << 17  # limit for very fast cameras
+_MOST_CHANGES = 20  # kept for display
+_MEAN_FRAMES = 500  # time constant of a sub-aperture's mean slope, about which the rms is taken
+_FEWEST_FRAMES = 10  # needed for a mean
+_STRIP = ("time_s", "method", "latency_us", "longest_us", "rms_px", "flux_e", "lost", "strehl", "rms_nm")
+"""Row of the strip charts: frames of one method in one read of the telemetry."""
+_FRAME = ("time_s", "method", "latency_us", "rms_px", "flux_e", "valid", "strehl")
+"""Row of the last frames."""
+_MEAN_PICTURES = 20  # time constant of the mean images from which the star's flux is taken
+_BIN_EDGES_US = 2.0 ** (np.arange(0, 20 * 4 + 1) / 4)  # 1 us to 1 s, four bins in a factor of 2
+_COMPARED = {
+    "rms of slopes (px)": ("rms_px", 1.0),
+    "flux kept (e-)": ("flux_e", 1.0),
+    "valid (%)": ("valid", 100.0),
+    "latency (µs)": ("latency_us", 1.0),
+    "Strehl ratio": ("strehl", 1.0),
+}
+
 
 @dataclass(frozen=True)
 class Picture:
@@ -62,29 +84,6 @@ class BatchSource(Protocol):
     def state(self) -> dict[str, Any]:
         """Return the state of the source as plain values for the page."""
         ...
-
-
-STRIP_S = 30.0
-"""Time span of the strip charts [s]."""
-FRAMES_S = 60.0
-"""Time span of percentiles, the histogram and the comparison of methods [s]."""
-_MOST_FRAMES = 1 << 17  # limit for very fast cameras
-_MOST_CHANGES = 20  # kept for display
-_MEAN_FRAMES = 500  # time constant of a sub-aperture's mean slope, about which the rms is taken
-_FEWEST_FRAMES = 10  # needed for a mean
-_STRIP = ("time_s", "method", "latency_us", "longest_us", "rms_px", "flux_e", "lost", "strehl", "rms_nm")
-"""Row of the strip charts: frames of one method in one read of the telemetry."""
-_FRAME = ("time_s", "method", "latency_us", "rms_px", "flux_e", "valid", "strehl")
-"""Row of the last frames."""
-_MEAN_PICTURES = 20  # time constant of the mean images from which the star's flux is taken
-_BIN_EDGES_US = 2.0 ** (np.arange(0, 20 * 4 + 1) / 4)  # 1 us to 1 s, four bins in a factor of 2
-_COMPARED = {
-    "rms of slopes (px)": ("rms_px", 1.0),
-    "flux kept (e-)": ("flux_e", 1.0),
-    "valid (%)": ("valid", 100.0),
-    "latency (µs)": ("latency_us", 1.0),
-    "Strehl ratio": ("strehl", 1.0),
-}
 
 
 class PageState:

@@ -35,6 +35,20 @@ from faintspot.base.files import Closing
 from faintspot.base.text_files import parse_json, to_json
 from faintspot.slopes.kernels.ordered import load, store
 
+FOLDER = Path("/dev/shm")
+"""Folder of named shared memory on Linux."""
+CELL = 16
+"""Distance of two cells, in numbers of 8 bytes."""
+CLOSED = 0
+FOLLOWED, LOST, FOLLOWER, FOLLOWER_START = range(4)
+"""Places in `Segment.follower`: arrivals finished, frames lost, the reader's process (or 0), its start."""
+
+_START = struct.Struct("<8sIII")
+_MAGIC, _VERSION = b"faintspt", 1
+_FOLLOWER_BYTE, _PAGE = 128, 4096
+_READ = os.O_RDONLY | os.O_NONBLOCK | os.O_NOFOLLOW  # neither block on a pipe nor follow a link
+_LARGEST = 1 << 36
+
 
 def process_start(pid: int) -> int:
     """Return when a process started, in clock ticks since boot; -1 if it does not exist or is dead.
@@ -61,21 +75,6 @@ def process_age_s(pid: int) -> float:
     """Return how long ago a process started [s]; -1 if it does not exist or is dead."""
     start = process_start(pid)
     return -1.0 if start < 0 else time.clock_gettime(time.CLOCK_BOOTTIME) - start / os.sysconf("SC_CLK_TCK")
-
-
-FOLDER = Path("/dev/shm")
-"""Folder of named shared memory on Linux."""
-CELL = 16
-"""Distance of two cells, in numbers of 8 bytes."""
-CLOSED = 0
-FOLLOWED, LOST, FOLLOWER, FOLLOWER_START = range(4)
-"""Places in `Segment.follower`: arrivals finished, frames lost, the reader's process (or 0), its start."""
-
-_START = struct.Struct("<8sIII")
-_MAGIC, _VERSION = b"faintspt", 1
-_FOLLOWER_BYTE, _PAGE = 128, 4096
-_READ = os.O_RDONLY | os.O_NONBLOCK | os.O_NOFOLLOW  # neither block on a pipe nor follow a link
-_LARGEST = 1 << 36
 
 
 class Segment(Closing):

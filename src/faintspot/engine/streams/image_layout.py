@@ -23,6 +23,48 @@ SEMAPHORE_BYTES = 32
 """Size of a semaphore in memory (sem_t on 64-bit Linux)."""
 _NAP_S = 5e-4
 
+ISIO = "isio"
+"""Kind of the streams, which begins their names: isio:NAME."""
+VERSION = b"2.00"
+SEMAPHORES, TRACES = 10, 10
+"""Default numbers of semaphores and of entries in the write-trace table."""
+MOST_POSTED = 10
+"""Semaphore value up to which a publication posts."""
+TYPES = {1: "u1", 2: "i1", 3: "u2", 4: "i2", 5: "u4", 6: "i4", 7: "u8", 8: "i8", 9: "f4", 10: "f8", 13: "f2"}
+FLOAT32, MATH_DATA = 9, 2
+_CIRCULAR, _KINDS_OF_IMAGE, _CIRCULAR_IN_TIME = 0x1, 0xF, (0xF000F, 0x20001)
+_TRACE_BYTES, _CIRCULAR_FRAME_BYTES, _TIME_BYTES = 64, 48, 16
+_LARGEST_BYTES = 1 << 36
+
+_FIELDS = {
+    "version": ("S32", 0),
+    "name": ("S80", 32),
+    "naxis": ("u1", 112),
+    "size": ("3u4", 116),
+    "nelement": ("u8", 128),
+    "datatype": ("u1", 136),
+    "imagetype": ("u8", 144),
+    "creationtime": ("2i8", 152),
+    "lastaccesstime": ("2i8", 168),
+    "atime": ("2i8", 184),
+    "writetime": ("2i8", 200),
+    "creatorPID": ("i4", 216),
+    "shared": ("u1", 224),
+    "inode": ("u8", 232),
+    "location": ("i1", 240),
+    "sem": ("u2", 258),
+    "NBproctrace": ("u2", 260),
+    "cnt0": ("u8", 264),
+    "cnt1": ("u8", 272),
+    "write": ("u1", 288),
+    "NBkw": ("u2", 290),
+    "CBsize": ("u4", 292),
+    "imdatamemsize": ("u8", 312),
+}
+
+COUNTER, WRITING = _FIELDS["cnt0"][1], _FIELDS["write"][1]
+"""Byte offsets of the number of publications, and of the flag that a write is in progress."""
+
 
 class _Time(ctypes.Structure):
     _fields_ = (("seconds", ctypes.c_int64), ("nanoseconds", ctypes.c_int64))
@@ -74,53 +116,11 @@ class Semaphore:
         return False
 
 
-ISIO = "isio"
-"""Kind of the streams, which begins their names: isio:NAME."""
-VERSION = b"2.00"
-SEMAPHORES, TRACES = 10, 10
-"""Default numbers of semaphores and of entries in the write-trace table."""
-MOST_POSTED = 10
-"""Semaphore value up to which a publication posts."""
-TYPES = {1: "u1", 2: "i1", 3: "u2", 4: "i2", 5: "u4", 6: "i4", 7: "u8", 8: "i8", 9: "f4", 10: "f8", 13: "f2"}
-FLOAT32, MATH_DATA = 9, 2
-_CIRCULAR, _KINDS_OF_IMAGE, _CIRCULAR_IN_TIME = 0x1, 0xF, (0xF000F, 0x20001)
-_TRACE_BYTES, _CIRCULAR_FRAME_BYTES, _TIME_BYTES = 64, 48, 16
-_LARGEST_BYTES = 1 << 36
-
-_FIELDS = {
-    "version": ("S32", 0),
-    "name": ("S80", 32),
-    "naxis": ("u1", 112),
-    "size": ("3u4", 116),
-    "nelement": ("u8", 128),
-    "datatype": ("u1", 136),
-    "imagetype": ("u8", 144),
-    "creationtime": ("2i8", 152),
-    "lastaccesstime": ("2i8", 168),
-    "atime": ("2i8", 184),
-    "writetime": ("2i8", 200),
-    "creatorPID": ("i4", 216),
-    "shared": ("u1", 224),
-    "inode": ("u8", 232),
-    "location": ("i1", 240),
-    "sem": ("u2", 258),
-    "NBproctrace": ("u2", 260),
-    "cnt0": ("u8", 264),
-    "cnt1": ("u8", 272),
-    "write": ("u1", 288),
-    "NBkw": ("u2", 290),
-    "CBsize": ("u4", 292),
-    "imdatamemsize": ("u8", 312),
-}
-
-
 def _record(fields: Mapping[str, tuple[str, int]], size: int) -> np.dtype[np.void]:
     formats, offsets = zip(*fields.values(), strict=True)
     return np.dtype({"names": [*fields], "formats": formats, "offsets": offsets, "itemsize": size})
 
 
-COUNTER, WRITING = _FIELDS["cnt0"][1], _FIELDS["write"][1]
-"""Byte offsets of the number of publications, and of the flag that a write is in progress."""
 METADATA = _record(_FIELDS, 384)
 KEYWORD = _record({"name": ("S16", 0), "type": ("S1", 16), "value": ("i8", 24), "cnt": ("u8", 40)}, 128)
 

@@ -28,6 +28,16 @@ from faintspot.slopes.estimators.registry import estimators
 from faintspot.slopes.pipeline.settings import Settings
 from faintspot.slopes.spots.psf import PSF, spot_psf
 
+_STREHL_LEVELS = (0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8)
+
+LOOP_GAIN = "loop_gain"
+NOISE_SCALE = "noise_scale"
+# How far spots are from where a prior expects them is the loop's to say: parts of their range.
+_PRIORS = (0.1, 0.175, 0.25, 0.35, 0.5, 0.75)
+_STEPS_BEYOND = 2  # in the ratio of an end to its neighbour
+_FEWEST_TO_WIDEN = 4
+_FIRST_VALUES = (3, 2)  # of a method's first option, and of each further one
+
 
 def magnitude_limit(magnitudes: ArrayLike, strehl: ArrayLike, level: float) -> Estimate:
     """Return the limiting magnitude at a Strehl ratio; parameters are those of `magnitude_gain`."""
@@ -124,9 +134,6 @@ def _differences(ends: Floats, starts: Floats) -> Floats:
     return np.asarray(np.where(same, 0.0, ends) - np.where(same, 0.0, starts), np.float64)
 
 
-_STREHL_LEVELS = (0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8)
-
-
 @dataclass(frozen=True, eq=False)
 class MagnitudeResult(NpzFile):
     """Strehl ratio against the star's flux: A methods, F fluxes, R realisations of the air."""
@@ -174,15 +181,6 @@ def gains_in_magnitude(result: MagnitudeResult, method: int, reference: int) -> 
         for level in _STREHL_LEVELS
         if len(finite) and finite.min() < level <= finite.max()
     }
-
-
-LOOP_GAIN = "loop_gain"
-NOISE_SCALE = "noise_scale"
-# How far spots are from where a prior expects them is the loop's to say: parts of their range.
-_PRIORS = (0.1, 0.175, 0.25, 0.35, 0.5, 0.75)
-_STEPS_BEYOND = 2  # in the ratio of an end to its neighbour
-_FEWEST_TO_WIDEN = 4
-_FIRST_VALUES = (3, 2)  # of a method's first option, and of each further one
 
 
 @dataclass(frozen=True)

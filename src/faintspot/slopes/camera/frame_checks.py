@@ -20,6 +20,21 @@ _FEWEST = 4  # spots
 _SIGNIFICANT = 5.0  # standard errors by which the gains of many spots differ
 _SMOOTHING = np.outer([1, 2, 1], [1, 2, 1]) / 16  # weighs even and odd rows and columns alike
 
+_FEWEST_PIXELS, _FEWEST_VALUES = 4, 8  # clipped pixels of the frame, and values over all frames
+_PILE = 4.0  # of values at the largest one, over those at any other value of bright pixels
+_BRIGHT = 0.5  # of the range from the median to the largest value
+_FEWEST_STEPS = 16  # of that range, in the steps of the camera: fewer are photons counted one by one
+
+# By how much the correlation of neighbours is higher in the right order; and the correlations along rows of
+# bytes read one by one: low and high bytes alternate, and every second is alike.
+_SMOOTHER, _ALTERNATE, _ALIKE = 0.2, -0.2, 0.5
+_CENTRAL, _FEW = (0.005, 0.995), 8  # pixels that count; range of the high bytes over that of the low ones
+# Noise about 0 that wraps around: part of the range between neighbours, and part of the neighbours.
+_WRAPPED, _OFTEN = 0.75, 0.02
+
+_HOT = 8.0  # standard deviations of the noise
+_SHARPNESS = 4.0  # excess over the spread of the neighbours; at most 3 for a Nyquist-sampled spot
+
 
 def mosaic_contrast(
     frame: NDArray[np.float64], spots: NDArray[np.float64], pitch_px: float, spot_px: float
@@ -69,12 +84,6 @@ def mosaic_contrast(
     agree = float(np.mean(above > 0))
     contrast = float(gain.max() / max(gain.min(), 1e-3))
     return contrast if agree > _AGREE and _CONTRAST < contrast < _NO_FILTER else 1.0
-
-
-_FEWEST_PIXELS, _FEWEST_VALUES = 4, 8  # clipped pixels of the frame, and values over all frames
-_PILE = 4.0  # of values at the largest one, over those at any other value of bright pixels
-_BRIGHT = 0.5  # of the range from the median to the largest value
-_FEWEST_STEPS = 16  # of that range, in the steps of the camera: fewer are photons counted one by one
 
 
 class LargestValues:
@@ -137,14 +146,6 @@ class LargestValues:
         return largest if piled and fine and largest < self._limit else None
 
 
-# By how much the correlation of neighbours is higher in the right order; and the correlations along rows of
-# bytes read one by one: low and high bytes alternate, and every second is alike.
-_SMOOTHER, _ALTERNATE, _ALIKE = 0.2, -0.2, 0.5
-_CENTRAL, _FEW = (0.005, 0.995), 8  # pixels that count; range of the high bytes over that of the low ones
-# Noise about 0 that wraps around: part of the range between neighbours, and part of the neighbours.
-_WRAPPED, _OFTEN = 0.75, 0.02
-
-
 def misread(frame: NDArray[Any]) -> str:
     """Return why the numbers of a frame (h, w) are probably not those of the camera; empty if they are.
 
@@ -189,10 +190,6 @@ def _smoothness(image: NDArray[np.generic]) -> float:
 def _correlation(one: NDArray[np.generic], other: NDArray[np.generic]) -> float:
     a, b = (part.astype(np.float64).ravel() - part.mean() for part in (one, other))
     return float(a @ b / max(np.sqrt((a @ a) * (b @ b)), 1e-300))
-
-
-_HOT = 8.0  # standard deviations of the noise
-_SHARPNESS = 4.0  # excess over the spread of the neighbours; at most 3 for a Nyquist-sampled spot
 
 
 def find_hot_pixels(frame: ArrayLike) -> NDArray[np.int64]:

@@ -19,6 +19,18 @@ from faintspot.slopes.spots.psf import PSF
 _BLOCKS = 20  # of frames, whose scatter says the error: noise and turbulence are correlated for shorter
 _FEWEST_FRAMES = 2 * _BLOCKS
 
+_BEYOND = 0.01  # share of the spots that may be farther out
+_SMALLEST_STEP_PX, _STEPS_PER_SIDE = 0.25, 64
+_FLUX_CLASS = 1.25  # ratio of the fluxes of sub-apertures that share a table
+_FAINTEST = 0.05  # of the mean flux
+_WEIGHT_FLOOR = 1e-3  # of the flux, in electrons squared: faint wings are not known exactly
+_ITERATIONS = 200
+_SCALES = (0.02, 1.5)  # of the fitted flux, within which the flux is sought
+_IMAGES_FOR_SCALE = 512
+_DECISIVE_NATS = 3.0  # log likelihood by which another range must be worse
+_ELSEWHERE = 0.1  # share of the spots that the other hypothesis has anywhere in the window
+_NEARLY_ALL = 0.8  # of half a window: a larger range is not distinguished from the whole window
+
 
 @dataclass(frozen=True)
 class CentroidGain:
@@ -99,19 +111,6 @@ def measure_centroid_gain(slopes: Slopes | ArrayLike, displacement_px: ArrayLike
     parts = np.stack([part.sum(axis=0) for part in np.array_split(residual, _BLOCKS)])
     error = parts.std(axis=0, ddof=1) * math.sqrt(_BLOCKS) / square
     return CentroidGain(gain.reshape(2, n).T, error.reshape(2, n).T)
-
-
-_BEYOND = 0.01  # share of the spots that may be farther out
-_SMALLEST_STEP_PX, _STEPS_PER_SIDE = 0.25, 64
-_FLUX_CLASS = 1.25  # ratio of the fluxes of sub-apertures that share a table
-_FAINTEST = 0.05  # of the mean flux
-_WEIGHT_FLOOR = 1e-3  # of the flux, in electrons squared: faint wings are not known exactly
-_ITERATIONS = 200
-_SCALES = (0.02, 1.5)  # of the fitted flux, within which the flux is sought
-_IMAGES_FOR_SCALE = 512
-_DECISIVE_NATS = 3.0  # log likelihood by which another range must be worse
-_ELSEWHERE = 0.1  # share of the spots that the other hypothesis has anywhere in the window
-_NEARLY_ALL = 0.8  # of half a window: a larger range is not distinguished from the whole window
 
 
 @dataclass(frozen=True)

@@ -31,6 +31,27 @@ GAINS = (0.03, 0.05, 0.07, 0.1, 0.13, 0.16, 0.2, 0.25, 0.3, 0.36, 0.43, 0.5, 0.6
 """Gains of an integrator that are tried."""
 _MOST_REPLAYED, _FEWEST_REPLAYED = 1_200_000, 500  # slopes, and frames, by which controllers are compared
 
+JUDGED_PART = 0.35
+"""Part of a stretch, its end, on which models are judged; they are learnt from the rest."""
+STANDARD_ERRORS = 2.0
+_BLOCK_FRAMES = 25
+_FEWEST_BLOCKS = 10
+FEWEST_FRAMES = math.ceil(_FEWEST_BLOCKS * _BLOCK_FRAMES / JUDGED_PART) + 1
+"""Frames of a stretch that can be learnt from and judged on."""
+
+Singles = NDArray[np.float32]
+
+FRAMES = 2000
+"""Frames that are kept, of large sensors fewer."""
+_MOST_BYTES = 64 << 20
+_LOWER_PRIORITY = 10  # above that of this process
+_CALL = (
+    "import pickle, sys; result, sys.stdout = sys.stdout.buffer, sys.stderr; "
+    "function, arguments = pickle.load(sys.stdin.buffer); pickle.dump(function(*arguments), result)"
+)
+
+Result = TypeVar("Result")
+
 
 def learn_controller(
     plant: LoopPlant,
@@ -91,15 +112,6 @@ def _fits(
         return [anywhere]
     # A line that the winds explain is no vibration in either model.
     return [windy, replace(anywhere, vibrations=windy.vibrations)]
-
-
-JUDGED_PART = 0.35
-"""Part of a stretch, its end, on which models are judged; they are learnt from the rest."""
-STANDARD_ERRORS = 2.0
-_BLOCK_FRAMES = 25
-_FEWEST_BLOCKS = 10
-FEWEST_FRAMES = math.ceil(_FEWEST_BLOCKS * _BLOCK_FRAMES / JUDGED_PART) + 1
-"""Frames of a stretch that can be learnt from and judged on."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -205,20 +217,6 @@ def error_of_mean(values: Floats) -> float:
     with np.errstate(invalid="ignore"):
         error = float(means.std(ddof=1)) / math.sqrt(blocks)
     return error if math.isfinite(error) else math.inf
-
-
-Singles = NDArray[np.float32]
-
-FRAMES = 2000
-"""Frames that are kept, of large sensors fewer."""
-_MOST_BYTES = 64 << 20
-_LOWER_PRIORITY = 10  # above that of this process
-_CALL = (
-    "import pickle, sys; result, sys.stdout = sys.stdout.buffer, sys.stderr; "
-    "function, arguments = pickle.load(sys.stdin.buffer); pickle.dump(function(*arguments), result)"
-)
-
-Result = TypeVar("Result")
 
 
 class RecentFrames:

@@ -37,6 +37,15 @@ from faintspot.loop.control.reconstructor import make_reconstructor
 
 _LEAK = 0.01
 
+_ORDERS = (4, 8, 12, 20, 30, 50, 80, 120, 200)
+_FRAMES_FOR_ORDER = 50  # frames of a recording for each coefficient
+_SPECTRUM_FOR_ORDER = 5  # frames of a piece of the spectrum for each coefficient
+_BLOCKS, _MOST_COMPARED = 4, 100  # of frames left out, and modes, by which orders are compared
+_FEWEST_COUPLED, _MOST_SOURCES = 8, 60
+"""Modes: fewer are independent; by the past of so many all are predicted."""
+_UNCERTAIN = 0.1  # of the variance of residual modes: gains differ by so much between modes and with time
+_RIDGES = (0.1, 0.3, 1.0, 3.0, 10.0)  # of the mean square of the past
+
 
 @dataclass(frozen=True, eq=False)
 class LoopOfControl:
@@ -188,15 +197,6 @@ class LoopInModes:
 
 
 Kind = Callable[[Kalman, LoopPlant, OpenLoopTelemetry, LoopInModes], Kalman]
-
-_ORDERS = (4, 8, 12, 20, 30, 50, 80, 120, 200)
-_FRAMES_FOR_ORDER = 50  # frames of a recording for each coefficient
-_SPECTRUM_FOR_ORDER = 5  # frames of a piece of the spectrum for each coefficient
-_BLOCKS, _MOST_COMPARED = 4, 100  # of frames left out, and modes, by which orders are compared
-_FEWEST_COUPLED, _MOST_SOURCES = 8, 60
-"""Modes: fewer are independent; by the past of so many all are predicted."""
-_UNCERTAIN = 0.1  # of the variance of residual modes: gains differ by so much between modes and with time
-_RIDGES = (0.1, 0.3, 1.0, 3.0, 10.0)  # of the mean square of the past
 
 
 def learn_modes(

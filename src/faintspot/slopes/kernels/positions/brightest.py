@@ -19,6 +19,26 @@ from faintspot.slopes.kernels.simd import (
     width_of,
 )
 
+SMALLEST_VARIANCE = 1e-4
+"""Electrons squared: keeps the weights finite where there is no noise."""
+
+# Rows of the table of per-lane numbers (n_rows, W).
+RANK = 0  # in: the threshold is the RANK-th largest pixel
+SUBTRACT = 1  # in: 1 to take the threshold off the pixels that stay, 0 to keep them as they are
+THRESHOLD = 2  # out
+LARGEST = 3  # out: largest magnitude of the image
+# Out, in the order of a group's results: centre of gravity of what stays, px from the centre, and its flux;
+# standard errors, px, and covariance, px^2.
+X, Y, SUM, ERROR_X, ERROR_Y, COVARIANCE = range(4, 10)
+VARIANCE, EXCESS = 10, 11  # in: variance of a pixel that collects m electrons, VARIANCE + EXCESS m
+SPREAD = 12  # in: pixels over which denoising correlates the noise
+LANE_ROWS = 13
+# Least squared ratio of the flux that stays to its noise; below it, errors are not proportional to the noise.
+_SIGNIFICANT = 6.25
+_CORRELATED = 3.0  # noise that remains after smoothing and a threshold, over that of as many pixels
+
+_COUNTING_PASSES = 24  # usually 5 to 8 are enough; outliers go on to the exact passes
+
 
 @compiled
 def gather_taps(width: int, first: Any, taps: Any, lane_taps: Any) -> None:
@@ -67,10 +87,6 @@ def smooth_group(
             store(output, at, smooth_pixel(lanes, half_done, at, nx * width, y, ny, taps, 1, reach))
 
 
-SMALLEST_VARIANCE = 1e-4
-"""Electrons squared: keeps the weights finite where there is no noise."""
-
-
 @compiled
 def variance_of(lanes: Lanes, variances: Any, at: Any, mean: Any) -> Any:
     """Return the variance of the pixel at element `at`; `mean` where it is the same in all."""
@@ -112,24 +128,6 @@ def without_noisy_pixels(
         relative = relative_variance(lanes, variances, place + i * width, mean)
         store(damped, i * width, load(lanes, image, i * width) / maximum(relative, splat(lanes, 1.0)))
     return damped
-
-
-# Rows of the table of per-lane numbers (n_rows, W).
-RANK = 0  # in: the threshold is the RANK-th largest pixel
-SUBTRACT = 1  # in: 1 to take the threshold off the pixels that stay, 0 to keep them as they are
-THRESHOLD = 2  # out
-LARGEST = 3  # out: largest magnitude of the image
-# Out, in the order of a group's results: centre of gravity of what stays, px from the centre, and its flux;
-# standard errors, px, and covariance, px^2.
-X, Y, SUM, ERROR_X, ERROR_Y, COVARIANCE = range(4, 10)
-VARIANCE, EXCESS = 10, 11  # in: variance of a pixel that collects m electrons, VARIANCE + EXCESS m
-SPREAD = 12  # in: pixels over which denoising correlates the noise
-LANE_ROWS = 13
-# Least squared ratio of the flux that stays to its noise; below it, errors are not proportional to the noise.
-_SIGNIFICANT = 6.25
-_CORRELATED = 3.0  # noise that remains after smoothing and a threshold, over that of as many pixels
-
-_COUNTING_PASSES = 24  # usually 5 to 8 are enough; outliers go on to the exact passes
 
 
 @inlined
