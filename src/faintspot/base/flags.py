@@ -49,10 +49,7 @@ class SubapertureFlag(IntFlag):
 UNMEASURED = SubapertureFlag.NO_FLUX | SubapertureFlag.TOO_MANY_BAD_PIXELS
 """Flags of sub-apertures without a position: their slope is 0."""
 
-KEEPABLE = {
-    "limited": SubapertureFlag.AT_SEARCH_LIMIT,
-    "unlike": SubapertureFlag.UNLIKE_NEIGHBOURS,
-}
+KEEPABLE = {"limited": SubapertureFlag.AT_SEARCH_LIMIT, "unlike": SubapertureFlag.UNLIKE_NEIGHBOURS}
 """Flags of positions that are probably wrong, by the names under which they can be kept valid."""
 
 NO_FLAG = SubapertureFlag(0)
@@ -79,11 +76,7 @@ def kept_flags(names: Iterable[str]) -> SubapertureFlag:
     return flags
 
 
-_CAUSES = {
-    "dark": SubapertureFlag.NO_FLUX,
-    "bad pixels": SubapertureFlag.TOO_MANY_BAD_PIXELS,
-    **KEEPABLE,
-}
+_CAUSES = {"dark": SubapertureFlag.NO_FLUX, "bad pixels": SubapertureFlag.TOO_MANY_BAD_PIXELS, **KEEPABLE}
 
 
 def are_valid(flags: NDArray[Any], keep: SubapertureFlag = NO_FLAG) -> NDArray[np.bool_]:

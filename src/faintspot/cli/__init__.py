@@ -30,11 +30,7 @@ _COMMANDS = {
     "wavefront": "Fit Zernike modes to slopes, and draw the wavefront.",
 }
 
-_HOMES = {
-    "estimators": "tune:list_estimators",
-    "live": "realtime.run:live",
-    "loop": "study:loop_group",
-}
+_HOMES = {"estimators": "tune:list_estimators", "live": "realtime.run:live", "loop": "study:loop_group"}
 """Module and function of commands whose module is not named after them."""
 _OF_POSIX = ("fcntl", "resource")
 

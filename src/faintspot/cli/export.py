@@ -63,13 +63,7 @@ def _telemetry(telemetry: Path, output: str | None, ao_mode: str) -> None:
 )
 @REFERENCE
 @option("--no-build", is_flag=True, help="Write the sources, but do not build the library.")
-def _library(
-    config: str,
-    output: str,
-    cpus: tuple[str, ...],
-    reference: str | None,
-    no_build: bool,
-) -> None:
+def _library(config: str, output: str, cpus: tuple[str, ...], reference: str | None, no_build: bool) -> None:
     """Write a C library that measures slopes without Python, and a bundle of tables for this sensor.
 
     TOML is a configuration (default: faintspot.toml). FOLDER gets faintspot.h, faintspot.c, object files and

@@ -15,14 +15,7 @@ from rich.console import Console
 
 from faintspot.base.errors import InputError
 from faintspot.base.tables import save_tables
-from faintspot.cli.commands import (
-    SectionedCommand,
-    declared,
-    flag_of,
-    option,
-    suggested_slopes,
-    which_frames,
-)
+from faintspot.cli.commands import SectionedCommand, declared, flag_of, option, suggested_slopes, which_frames
 from faintspot.cli.output import (
     check_target,
     picture_file,

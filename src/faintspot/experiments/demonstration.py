@@ -80,12 +80,7 @@ def simulate(
 ) -> tuple[NDArray[Any], NDArray[np.float64]]:
     """Return frames in ADU and the true positions (n_frames, n, 2), px."""
     return sensor_frames(
-        layout,
-        n_frames,
-        flux_e=flux_e,
-        position_range_px=POSITION_RANGE_PX,
-        detector=DETECTOR,
-        rng=rng,
+        layout, n_frames, flux_e=flux_e, position_range_px=POSITION_RANGE_PX, detector=DETECTOR, rng=rng
     )
 
 

@@ -70,11 +70,7 @@ def method_for_scene(kind: type[Estimator], scene: Scene, *, psf: PSF | None = N
         search_range_px=scene.position_range_px,
         **_rounded(width),
     )
-    return Method(
-        kind.label,
-        settings,
-        psf=psf if Need.PSF in kind.needs else None,
-    )
+    return Method(kind.label, settings, psf=psf if Need.PSF in kind.needs else None)
 
 
 def tuned_options(method: Method, scene: Scene) -> dict[str, list[object]]:

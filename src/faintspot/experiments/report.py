@@ -199,10 +199,7 @@ def study_report(dataset: xarray.Dataset, night: Night | None = None) -> Report:
     return Report(
         title=f"{subject}: study “{specification.name}”",
         facts=_TEXT.facts("study.facts", attributes, **values),
-        sections=[
-            *sections,
-            configuration_section(str(attributes["specification"]), "Specification"),
-        ],
+        sections=[*sections, configuration_section(str(attributes["specification"]), "Specification")],
         warnings=_TEXT.lines("study.warnings", missing=(total - done) or None),
         warnings_title="This study is not finished",
         remark=_TEXT["study.remark"],

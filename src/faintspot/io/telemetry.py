@@ -13,13 +13,7 @@ from faintspot.base.errors import InputError, load_package
 from faintspot.base.files import check_bytes, memory_bytes
 from faintspot.base.flags import VARIABLES, are_valid
 from faintspot.io.stored_array import one_line
-from faintspot.io.zarr_store import (
-    TELEMETRY,
-    is_store,
-    open_store,
-    read_items,
-    stored_attributes,
-)
+from faintspot.io.zarr_store import TELEMETRY, is_store, open_store, read_items, stored_attributes
 
 zarr = load_package("zarr")
 FRAMES, IMAGES = "finished_frames", "finished_images"

@@ -135,10 +135,7 @@ def calibrate(
     if stroke is not None and amplitude > stroke:
         raise InputError(f"--amplitude {amplitude:g}: expected at most largest_command, {stroke:g}")
     number = actuators or _known_commands(former, name)
-    with (
-        StreamedMirror(name, number, **averaging) as mirror,
-        progress_bar("pokes", "rounds") as advance,
-    ):
+    with StreamedMirror(name, number, **averaging) as mirror, progress_bar("pokes", "rounds") as advance:
         total: Any = None
         found = calibrate_mirror(mirror, amplitude, error, rounds, lambda done, _: advance(done, total))
     reference = former.reference if keep_reference and former else mirror.reference + found.reference

@@ -106,11 +106,7 @@ def replay(
 @name_option("Name of the pixel ring and of the engine's streams.")
 @FRAMES
 def bridge(
-    stream: str | None,
-    slopes: str | None,
-    commands: str | None,
-    name: str,
-    frames: int | None,
+    stream: str | None, slopes: str | None, commands: str | None, name: str, frames: int | None
 ) -> None:
     """Connect `faintspot realtime run` with other software's streams in shared memory.
 

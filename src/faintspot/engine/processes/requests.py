@@ -193,10 +193,7 @@ def request(path: str | Path, command: str, /, *, timeout_s: float = 5.0, **fiel
         raise InputError(f"request: expected what JSON can hold ({error})") from None
     if len(line) > LARGEST_REQUEST:
         raise InputError(f"request: expected at most {LARGEST_REQUEST} bytes, got {len(line)}")
-    with (
-        socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as connection,
-        connection.makefile("rb") as stream,
-    ):
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as connection, connection.makefile("rb") as stream:
         connection.settimeout(timeout_s)
         try:
             _connect(connection, Path(path), time.monotonic() + timeout_s)

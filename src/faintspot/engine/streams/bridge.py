@@ -74,12 +74,7 @@ class StreamBridge(Follower):
     holds = "pixels"
 
     def __init__(
-        self,
-        stream: str,
-        name: str,
-        *,
-        say: Callable[[str], None] | None = None,
-        spins: bool | None = None,
+        self, stream: str, name: str, *, say: Callable[[str], None] | None = None, spins: bool | None = None
     ) -> None:
         super().__init__(stream, say, _no_frames)
         self.name, self.counters = name, BridgeCounters()

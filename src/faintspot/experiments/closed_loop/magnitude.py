@@ -169,10 +169,7 @@ class Experiment:
         return units
 
     def _scoring(
-        self,
-        kinds: Sequence[Method],
-        stars: Stars,
-        choices: Choices,
+        self, kinds: Sequence[Method], stars: Stars, choices: Choices
     ) -> dict[tuple[str, float], Unit]:
         run, units = self.configuration.run, {}
         for kind in kinds:

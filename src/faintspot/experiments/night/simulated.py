@@ -131,11 +131,7 @@ def _key(number: int, alone: bool) -> str:
 
 
 def observe(
-    configuration: LoopConfiguration,
-    plan: NightPlan,
-    number: int,
-    alone: bool,
-    advance: Advance,
+    configuration: LoopConfiguration, plan: NightPlan, number: int, alone: bool, advance: Advance
 ) -> dict[str, NDArray[np.generic]]:
     """Observe one set; return the values of its blocks, NaN up to the number of blocks of the longest set.
 

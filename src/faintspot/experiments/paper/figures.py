@@ -12,13 +12,7 @@ from faintspot.base.report.page import FigureWithData
 from faintspot.base.report.plots import METHOD_COLOURS, WIDTH, Line, Panel, Picture
 from faintspot.base.report.texts import Texts
 from faintspot.experiments.methods import NO_TV, TV, knows_the_spot, label_of, style_of
-from faintspot.experiments.paper.claims import (
-    fixed_mode,
-    grouped,
-    in_words,
-    mode_in_words,
-    parameters_of,
-)
+from faintspot.experiments.paper.claims import fixed_mode, grouped, in_words, mode_in_words, parameters_of
 from faintspot.experiments.study.curves import kept_panels, measured_profiles, names_of, shared_in_words
 from faintspot.experiments.study.specification import BEST
 from faintspot.experiments.study.sweep import PARAMETERS, STANDARD
@@ -184,10 +178,7 @@ def _styles(labels: Sequence[str]) -> dict[str, dict[str, Any]]:
 
 
 def _tv_lines(
-    dataset: xarray.Dataset,
-    parts: dict[str, list[int]],
-    styles: dict[str, dict[str, object]],
-    axis: str,
+    dataset: xarray.Dataset, parts: dict[str, list[int]], styles: dict[str, dict[str, object]], axis: str
 ) -> list[Line]:
     """Return R with and without TV against an axis, for each label."""
     lines = []

@@ -58,11 +58,7 @@ class LoopCell:
 
 
 def run_loop_map(
-    folder: str | Path,
-    *,
-    quick: bool = False,
-    pool: WorkerPool | None = None,
-    overwrite: bool = False,
+    folder: str | Path, *, quick: bool = False, pool: WorkerPool | None = None, overwrite: bool = False
 ) -> list[LoopCell]:
     """Measure with which flux, read noise and turbulence denoising raises the Strehl ratio.
 

@@ -183,11 +183,6 @@ class Spots:
         if not self.d_over_r0:
             return spots(positions, **self.form) / flux, positions
         images, _ = speckled_spots(
-            n,
-            d_over_r0=self.d_over_r0,
-            shape=self.shape,
-            size=self.size,
-            positions=positions,
-            rng=phase_rng,
+            n, d_over_r0=self.d_over_r0, shape=self.shape, size=self.size, positions=positions, rng=phase_rng
         )
         return images / flux, positions

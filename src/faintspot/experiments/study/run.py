@@ -13,14 +13,7 @@ from faintspot.base.errors import InputError, MissingExtraError, drawn
 from faintspot.base.report.texts import Texts
 from faintspot.base.statistics import OUTLIER_PX
 from faintspot.experiments.running import Advance, Unit, WorkerPool, run_units
-from faintspot.experiments.store import (
-    DONE,
-    OWN_ATTRIBUTES,
-    Arrays,
-    UnitStore,
-    ZarrStore,
-    kind_of_store,
-)
+from faintspot.experiments.store import DONE, OWN_ATTRIBUTES, Arrays, UnitStore, ZarrStore, kind_of_store
 from faintspot.experiments.study.cell import measure_cell
 from faintspot.experiments.study.specification import StudySpecification
 from faintspot.experiments.study.sweep import PARAMETERS, RANGES, Cell

@@ -141,9 +141,7 @@ def _command(reconstructor: Reconstructor, slopes: Floats, stroke: float | None)
     driven = reconstructor.slopes_of_modes @ reconstructor.modes.T
     damping = np.sqrt(reconstructor.damping) * np.eye(actuators)
     bounded = scipy.optimize.lsq_linear(
-        np.concatenate([driven, damping]),
-        np.concatenate([slopes, np.zeros(actuators)]),
-        (-stroke, stroke),
+        np.concatenate([driven, damping]), np.concatenate([slopes, np.zeros(actuators)]), (-stroke, stroke)
     )
     return np.asarray(np.clip(bounded.x, -stroke, stroke))
 

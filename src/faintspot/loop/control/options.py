@@ -81,17 +81,10 @@ class ControlOptions(IntegratorOptions):
         high=3600,
     )
     guard_frames: int = setting(
-        50,
-        "Number of frames over which the guard averages.",
-        low=1,
-        high=1_000_000,
-        whole=True,
+        50, "Number of frames over which the guard averages.", low=1, high=1_000_000, whole=True
     )
     most_invalid: float = setting(
-        0.5,
-        "Fraction of invalid slopes above which the guard opens the loop; 1: never.",
-        low=0,
-        high=1,
+        0.5, "Fraction of invalid slopes above which the guard opens the loop; 1: never.", low=0, high=1
     )
     largest_residual_px: float | None = setting(
         None,

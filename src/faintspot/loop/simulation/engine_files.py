@@ -14,12 +14,7 @@ from faintspot.loop.simulation.configuration import LoopConfiguration
 from faintspot.loop.simulation.learning import learnt_control
 from faintspot.loop.simulation.methods import PREDICTED, PRIOR, Method
 from faintspot.loop.simulation.simulation import measure_gains, simulate_loop
-from faintspot.loop.simulation.telescope import (
-    camera_calibration,
-    make_pipeline,
-    prepare,
-    reference_slopes,
-)
+from faintspot.loop.simulation.telescope import camera_calibration, make_pipeline, prepare, reference_slopes
 from faintspot.loop.slope_covariance import ARCSEC
 from faintspot.slopes.pipeline import configuration as configuration_file
 from faintspot.slopes.pipeline.settings import Settings
@@ -114,10 +109,5 @@ def _method(settings: Settings, psf: PSF, weights: FixedWeights | None, control:
         anything: dict[str, Any] = {PRIOR: 1.0}  # it becomes what the filter is sure of
         settings = settings.replace(**anything)
     return Method(
-        "-",
-        settings,
-        psf=psf,
-        weights=weights,
-        control=control,
-        variants=(PREDICTED,) if with_prior else (),
+        "-", settings, psf=psf, weights=weights, control=control, variants=(PREDICTED,) if with_prior else ()
     )

@@ -104,11 +104,7 @@ def simulate_loop(
 
 
 def measure_gains(
-    configuration: LoopConfiguration,
-    pipelines: Sequence[SlopePipeline],
-    *,
-    seed: int,
-    realisation: int = 0,
+    configuration: LoopConfiguration, pipelines: Sequence[SlopePipeline], *, seed: int, realisation: int = 0
 ) -> NDArray[np.float64]:
     """Return the centroid gain of each pipeline at the configuration's flux, by `centroid_gain`."""
     optics, detector = prepare(configuration), make_detector(configuration)

@@ -14,13 +14,7 @@ from faintspot.loop.control.reconstructor import Reconstructor, check_controllab
 from faintspot.loop.simulation.atmosphere import MovingLayers, make_atmosphere
 from faintspot.loop.simulation.configuration import LoopConfiguration
 from faintspot.loop.simulation.methods import Method
-from faintspot.loop.simulation.sections import (
-    CLOSED,
-    Atmosphere,
-    Camera,
-    ControlParameters,
-    RunLength,
-)
+from faintspot.loop.simulation.sections import CLOSED, Atmosphere, Camera, ControlParameters, RunLength
 from faintspot.loop.simulation.wavefront_sensor import (
     DeformableMirror,
     PupilAmplitude,
@@ -308,12 +302,7 @@ def of_optics(configuration: LoopConfiguration) -> LoopConfiguration:
     control, camera = configuration.control, Camera(photons_per_subaperture=1.0)
     kept = ControlParameters(largest_condition=control.largest_condition)
     return replace(
-        configuration,
-        name="-",
-        atmosphere=Atmosphere(),
-        camera=camera,
-        control=kept,
-        run=RunLength(),
+        configuration, name="-", atmosphere=Atmosphere(), camera=camera, control=kept, run=RunLength()
     )
 
 

@@ -70,11 +70,7 @@ class ControlChoice:
         """Return plain values."""
         names = ("residual", "less", "total", "strehl")
         gain = {"gain": self.gain} if math.isfinite(self.gain) else {}
-        return {
-            "name": self.name,
-            **gain,
-            **{name: getattr(self, name).as_values() for name in names},
-        }
+        return {"name": self.name, **gain, **{name: getattr(self, name).as_values() for name in names}}
 
 
 def compared_choices(

@@ -132,11 +132,7 @@ def tv_denoise(
 ) -> NDArray[Any]: ...
 @overload
 def tv_denoise(
-    images: ArrayLike,
-    noise_std: ArrayLike,
-    *,
-    full_output: Literal[True],
-    **options: Unpack[Denoising],
+    images: ArrayLike, noise_std: ArrayLike, *, full_output: Literal[True], **options: Unpack[Denoising]
 ) -> Denoised: ...
 def tv_denoise(
     images: ArrayLike,

@@ -193,11 +193,7 @@ def _load() -> None:
             point.load()
 
 
-_NEEDS = {
-    Need.READ_NOISE: "read noise",
-    Need.WIDTH: "the spots' width",
-    Need.PSF: "PSF",
-}
+_NEEDS = {Need.READ_NOISE: "read noise", Need.WIDTH: "the spots' width", Need.PSF: "PSF"}
 
 
 def needs_in_words(kind: type[Estimator]) -> str:

@@ -48,13 +48,7 @@ from faintspot.slopes.pipeline.plan import (
     packed_calibration,
 )
 from faintspot.slopes.pipeline.settings import Settings
-from faintspot.slopes.pipeline.slopes import (
-    RESULT_TYPES,
-    Slopes,
-    Stages,
-    prior_slopes,
-    reference_positions,
-)
+from faintspot.slopes.pipeline.slopes import RESULT_TYPES, Slopes, Stages, prior_slopes, reference_positions
 from faintspot.slopes.sensor.binning import binned_layout
 from faintspot.slopes.sensor.layout import Layout
 from faintspot.slopes.spots.fixed_weights import FixedWeights

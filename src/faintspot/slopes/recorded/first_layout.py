@@ -17,19 +17,9 @@ from faintspot.base.tables import Tables
 from faintspot.io.frames import FrameSource, open_frames
 from faintspot.slopes.camera.calibration import Calibration, binned, read_map
 from faintspot.slopes.camera.dark_frames import FEWEST_FRAMES
-from faintspot.slopes.camera.frame_checks import (
-    MeanFrame,
-    find_hot_pixels,
-    misread,
-    mosaic_contrast,
-)
+from faintspot.slopes.camera.frame_checks import MeanFrame, find_hot_pixels, misread, mosaic_contrast
 from faintspot.slopes.camera.photon_transfer import measure_detector
-from faintspot.slopes.recorded.first_settings import (
-    ASSUMED_NOISE_E,
-    WIDEST_PX,
-    FirstSettings,
-    first_settings,
-)
+from faintspot.slopes.recorded.first_settings import ASSUMED_NOISE_E, WIDEST_PX, FirstSettings, first_settings
 from faintspot.slopes.recorded.survey import UsualFrames, survey
 from faintspot.slopes.sensor.background import (
     least_difference,

@@ -299,10 +299,7 @@ class _Trial:
         tight = _reach(_TIGHT * self._displacement)
         following = [
             Settings(
-                "weighted",
-                weight_fwhm_px=_rounded(factor * self.fwhm_px),
-                search_range_px=reach,
-                **width,
+                "weighted", weight_fwhm_px=_rounded(factor * self.fwhm_px), search_range_px=reach, **width
             )
             for reach in (None, tight)
             for factor in self._weights

@@ -98,9 +98,7 @@ def window_size(name: str, value: object, factor: int = 1) -> tuple[int, int]:
     if max(window) > largest:
         needed = math.ceil(max(window) / LARGEST_WINDOW)
         raise InputError(
-            f"expected at most {largest}; bin = {needed} allows larger windows",
-            name=name,
-            value=max(window),
+            f"expected at most {largest}; bin = {needed} allows larger windows", name=name, value=max(window)
         )
     numbers_between(name, window, SMALLEST_WINDOW * factor, largest)
     if any(side % factor for side in window):

@@ -156,10 +156,7 @@ class LaserGuideStar:
         return profile
 
     def responses(
-        self,
-        altitudes_m: ArrayLike,
-        shape: tuple[int, int] = (16, 16),
-        positions: ArrayLike | None = None,
+        self, altitudes_m: ArrayLike, shape: tuple[int, int] = (16, 16), positions: ArrayLike | None = None
     ) -> Floats:
         """Return images of a density of 1 per metre at each altitude, and 0 at all others.
 

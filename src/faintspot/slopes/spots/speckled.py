@@ -202,12 +202,7 @@ def _pixel_samples(smallest_width: float) -> tuple[Floats, Floats]:
 
 
 def _intensities(
-    phase: Floats,
-    positions: Floats,
-    width: Floats,
-    shape: tuple[int, int],
-    nodes: Floats,
-    weights: Floats,
+    phase: Floats, positions: Floats, width: Floats, shape: tuple[int, int], nodes: Floats, weights: Floats
 ) -> Floats:
     """Return the pixel-integrated images (n, ny, nx) of phases, displaced to the positions.
 

@@ -121,11 +121,7 @@ class MeanImages:
 
 
 def fit_sodium_profile(
-    mean: MeanImages,
-    star: LaserGuideStar,
-    profile: SodiumProfile,
-    *,
-    dark_variance_e2: ArrayLike = 0.0,
+    mean: MeanImages, star: LaserGuideStar, profile: SodiumProfile, *, dark_variance_e2: ArrayLike = 0.0
 ) -> SodiumFit:
     """Return the sodium profile that all sub-apertures see, from their mean images.
 
@@ -221,11 +217,7 @@ def _constrained(fit: SodiumFit) -> SodiumFit:
 
 
 def fit_spot(
-    mean: MeanImages,
-    star: LaserGuideStar,
-    profile: SodiumProfile,
-    *,
-    dark_variance_e2: ArrayLike = 0.0,
+    mean: MeanImages, star: LaserGuideStar, profile: SodiumProfile, *, dark_variance_e2: ArrayLike = 0.0
 ) -> tuple[LaserGuideStar, SodiumFit]:
     """Return the star with its spot blurred as much as the mean images show, and the profile.
 

@@ -300,10 +300,7 @@ class BesideTheLoop(Generic[Result]):
 
 
 def replayed_slopes(
-    control: Callable[[Floats], Floats],
-    open_loop: OpenLoopTelemetry,
-    matrix: Floats,
-    delay: int,
+    control: Callable[[Floats], Floats], open_loop: OpenLoopTelemetry, matrix: Floats, delay: int
 ) -> Floats:
     """Return the mean square of the residual slopes that commands control, frame by frame, (frames,).
 

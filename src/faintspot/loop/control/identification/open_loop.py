@@ -14,12 +14,7 @@ from faintspot.base.arrays import Floats
 from faintspot.base.errors import InputError
 from faintspot.loop.control.base import OpenLoopTelemetry, without_prior
 from faintspot.loop.control.identification.layers import Identified
-from faintspot.loop.control.identification.loop_delay import (
-    GAINS,
-    DelayFits,
-    LoopDelay,
-    with_axes,
-)
+from faintspot.loop.control.identification.loop_delay import GAINS, DelayFits, LoopDelay, with_axes
 from faintspot.loop.control.identification.modal_delay import ModalFits, plateau
 from faintspot.loop.control.identification.recording import Recording
 from faintspot.loop.control.identification.slope_noise import noise_of_slopes

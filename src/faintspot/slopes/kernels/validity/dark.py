@@ -14,17 +14,7 @@ from faintspot.base.flags import UNMEASURED, SubapertureFlag
 from faintspot.slopes.kernels.compiling import compiled, inlined
 from faintspot.slopes.kernels.gather import Frames, pixels_of
 from faintspot.slopes.kernels.groups import SlopeArrays
-from faintspot.slopes.kernels.simd import (
-    absolute,
-    get,
-    load,
-    maximum,
-    select,
-    splat,
-    store,
-    sum_of,
-    width_of,
-)
+from faintspot.slopes.kernels.simd import absolute, get, load, maximum, select, splat, store, sum_of, width_of
 
 _UNMEASURED = int(UNMEASURED)
 _NO_FLUX = int(SubapertureFlag.NO_FLUX)

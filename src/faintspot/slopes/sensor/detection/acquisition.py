@@ -251,10 +251,7 @@ def acquire(
 
 
 def _with_rest(
-    of_node: NDArray[np.int64],
-    spots: NDArray[np.complex128],
-    nodes: NDArray[np.complex128],
-    pitch_px: float,
+    of_node: NDArray[np.int64], spots: NDArray[np.complex128], nodes: NDArray[np.complex128], pitch_px: float
 ) -> NDArray[np.int64]:
     """Match the spots that are left to the nodes that are left, where an aberration bends most."""
     used = of_node >= 0

@@ -140,9 +140,7 @@ _SAME = 0.06
 
 
 def find_candidates(
-    image: NDArray[np.float64],
-    geometries: tuple[str, ...],
-    pitch_range_px: tuple[float, float],
+    image: NDArray[np.float64], geometries: tuple[str, ...], pitch_range_px: tuple[float, float]
 ) -> list[tuple[float, Lattice]]:
     """Return scores and lattices that the spots of a frame may have, the most likely first.
 

@@ -235,10 +235,7 @@ def _without_background(
 
 
 def _fitted(
-    image: SpotImage,
-    lattice: Lattice,
-    illuminated_fraction: float | None,
-    pupil: PupilRegion | None,
+    image: SpotImage, lattice: Lattice, illuminated_fraction: float | None, pupil: PupilRegion | None
 ) -> LatticeFit:
     """Fit the lattice to the spots; if some are left over, follow them from neighbour to neighbour."""
     width_px = spot_width(image, lattice)
