@@ -4,8 +4,8 @@ from benchmarks.measuring import Table
 
 
 def number(value: float) -> str:
-    """Return three significant digits, or a whole number."""
-    if abs(value) >= 10 and value == round(value):
+    """Return three significant digits, or a whole number; counts are of type int."""
+    if isinstance(value, int) or (abs(value) >= 10 and value == round(value)):
         return f"{value:.0f}"
     if 0 < abs(value) < 1e-3:
         return f"{value:.0e}"

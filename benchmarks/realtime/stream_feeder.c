@@ -1,12 +1,13 @@
 /* Publish frames in a stream of ImageStreamIO every millisecond, and note when the slopes of each are published.
  *
  * Usage: stream_feeder FRAMES SLOPES PIXELS COLUMNS ROWS COUNT TIMES. PIXELS has raw frames of uint16, which are
- * repeated. TIMES gets three int64 [ns, TAI] for each of COUNT frames, after SETTLING others: when its counter
- * changed, when that of its slopes was seen to change (0: never), and how long this process had not looked. */
+ * repeated. TIMES gets four int64 [ns, TAI] for each of COUNT frames, after SETTLING others: when its counter
+ * changed, when that of its slopes was seen to change (0: never), the stamp of the slopes, and for how long this
+ * process had not looked. */
 #include "image_stream.h"
 
 enum { PERIOD_NS = 1000000, SETTLING = 1000, PATIENCE = 120000, AFTER = 100 };
-typedef struct { int64_t sent, seen, away; } times;
+typedef struct { int64_t sent, seen, stamp, away; } times;
 
 static int64_t in_ns(const struct timespec *t) { return t->tv_sec * 1000000000LL + t->tv_nsec; }
 static int64_t now_ns(void) {
@@ -40,7 +41,7 @@ int main(int argc, char **argv) {
             long place = slopes.keywords->value - first;
             published = slopes.head->count;
             if (place < 0 || place >= count) continue;
-            noted[place].seen = now, noted[place].away = now - looked;
+            noted[place] = (times){noted[place].sent, now, in_ns(&slopes.head->written), now - looked};
             if (place % (count / 20 + 1) == 0) fprintf(stderr, "\r  %3ld %%", 100 * place / count); /* seldom: it takes time */
         }
     }

@@ -3,9 +3,9 @@
 A feeder in C publishes 36 x 16 x 16 pixels every millisecond, and reads the counter of the slopes' stream
 all the time. The latency of a frame is from the stamp that the feeder takes just before it counts the frame
 to its first look at which the slopes are counted: one clock, one process, and both programs seen from
-outside. The feeder has a processor of its own, and what is measured has all others. Where the feeder was away
-for more than `AWAY_US` before that look, the latency may be as much shorter; those frames are counted. All
-have the ordinary priority.
+outside. The feeder has a processor of its own, and what is measured has all others, at ordinary priority.
+Where the feeder was away for more than `AWAY_US` before that look, the latency ends with the stamp in the
+slopes' stream, which its writer takes just before it counts them. Those frames are counted.
 
 The C program is examples/library/streams.c. The engine reads frames with `realtime run --stream`, and its
 slopes become a stream of ImageStreamIO by `realtime bridge --to`: two processes, and two copies more. Its own
@@ -88,16 +88,14 @@ def _prepared(folder: Path) -> tuple[Path, tuple[int, int]]:
 
 def _row(name: str, times: NDArray[np.int64]) -> Row:
     """Return the latencies of a run."""
-    sent, seen, away = times[times[:, 1] > 0].T
-    latencies_us = (seen - sent) / 1e3
+    sent, seen, stamp, away = times[times[:, 1] > 0].T
+    was_away = away > 1e3 * AWAY_US
+    latencies_us = (np.where(was_away, stamp, seen) - sent) / 1e3
     levels = {"median us": 0.5, "99 % us": 0.99, "99.9 % us": 0.999, "largest us": 1.0}
     values = {key: float(np.quantile(latencies_us, level)) for key, level in levels.items()}
-    counts = {
-        "frames": len(times),
-        "lost": len(times) - len(sent),
-        "feeder away": np.sum(away > 1e3 * AWAY_US),
-    }
-    return Row(name, {**values, **{key: float(count) for key, count in counts.items()}}, better="lower")
+    values |= {"frames": len(times), "lost": len(times) - len(sent)}
+    values["feeder away"] = int(np.sum(was_away))
+    return Row(name, values, better="lower")
 
 
 def _rows(folder: Path) -> Iterator[Row]:
@@ -125,7 +123,7 @@ def _rows(folder: Path) -> Iterator[Row]:
                 raise RuntimeError(f"{title}: the feeder has seen no slopes")
             own = request(socket_path(name), "status") if run in measured else None
         (folder / "wfs.im.shm").unlink()
-        yield _row(title, np.fromfile(folder / "times", np.int64).reshape(-1, 3))
+        yield _row(title, np.fromfile(folder / "times", np.int64).reshape(-1, 4))
         if own is not None:
             its = {column: own["latency"][key] for column, key in _STATUS.items()}
             yield Row("engine alone", its, better="lower")
