@@ -126,7 +126,7 @@ def _has_truth_values(value: object) -> bool:
 
 def number_between(
     name: str,
-    value: Any,
+    value: object,
     low: float = -np.inf,
     high: float = np.inf,
     *,
@@ -140,7 +140,7 @@ def number_between(
     return float(array)
 
 
-def increasing(name: str, value: Any, count: int, *, integer: bool = False) -> NDArray[Any]:
+def increasing(name: str, value: object, count: int, *, integer: bool = False) -> NDArray[Any]:
     """Return `count` increasing numbers, (count,), such as times or frame numbers; a column is one, too."""
     array = numbers_between(name, value, *(_WHOLE if integer else ()), integer=integer)
     is_column = array.size == count == max(array.shape, default=0)
@@ -149,7 +149,7 @@ def increasing(name: str, value: Any, count: int, *, integer: bool = False) -> N
     return array.ravel()
 
 
-def one_of(name: str, value: Any, choices: Sequence[str]) -> str:
+def one_of(name: str, value: object, choices: Sequence[str]) -> str:
     """Return `value` if it is one of the names in `choices`."""
     if not isinstance(value, str) or value not in choices:
         raise InputError(f"expected one of {', '.join(map(repr, choices))}", name=name, value=value)

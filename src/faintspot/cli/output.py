@@ -28,6 +28,8 @@ from faintspot.base.files import derived, write_atomically
 from faintspot.cli.commands import can_make, option
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
     from faintspot.experiments.night.protocol import Night
     from faintspot.experiments.running import WorkerPool
     from faintspot.loop.simulation.configuration import LoopConfiguration
@@ -72,7 +74,7 @@ def picture_file(target: Path, picture: str | None, ending: str) -> Path | None:
     return Path(picture) if picture else derived(target, ending)
 
 
-def write_picture(figure: Any, path: Path) -> None:
+def write_picture(figure: Figure, path: Path) -> None:
     """Write a figure as PNG."""
     from faintspot.base.report.plots import png
 

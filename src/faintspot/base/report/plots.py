@@ -94,7 +94,7 @@ def plain_ticks(axis: XAxis | YAxis, values: Iterable[float]) -> None:
     axis.set_major_formatter(FuncFormatter(lambda value, _: f"{float(f'{value:.3g}'):g}"))
 
 
-def _axis_above(axes: Axes, positions: Any, values: Iterable[float], label: str) -> None:
+def _axis_above(axes: Axes, positions: ArrayLike, values: Iterable[float], label: str) -> None:
     """Put a second axis on top: numbers to three digits at places of the first one."""
     top = axes.secondary_xaxis("top")
     labels = [f"{float(f'{value:.3g}'):g}" for value in values]

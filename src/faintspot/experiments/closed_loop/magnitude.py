@@ -1,6 +1,6 @@
 """Strehl ratio against the star's flux, for any list of methods, each tuned at every flux."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -33,7 +33,7 @@ from faintspot.experiments.closed_loop.search import (
 from faintspot.experiments.closed_loop.verdict import equal_methods
 from faintspot.experiments.methods import Choice
 from faintspot.experiments.running import Advance, Unit, WorkerPool, in_stages, run_units
-from faintspot.experiments.store import UnitStore, ZarrStore, fingerprint_of
+from faintspot.experiments.store import Arrays, UnitStore, ZarrStore, fingerprint_of
 from faintspot.loop.control.base import INTEGRATOR
 from faintspot.loop.simulation.configuration import LoopConfiguration
 from faintspot.loop.simulation.methods import Method
@@ -181,7 +181,12 @@ class Experiment:
         return units
 
     def _run(
-        self, stage: str, function: Any, units: Mapping[Any, Unit], pool: WorkerPool, suffix: str = ""
+        self,
+        stage: str,
+        function: Callable[..., Arrays],
+        units: Mapping[tuple[str, float], Unit],
+        pool: WorkerPool,
+        suffix: str = "",
     ) -> UnitStore:
         """Run units that are kept in a store of the folder."""
         pool.say(stage)

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from faintspot.base.report.page import FigureWithData
 from faintspot.base.report.plots import METHOD_COLOURS, WIDTH, Line, Panel, Picture
@@ -193,7 +193,7 @@ def _tv_lines(
     return lines
 
 
-def _range_of(axis: str, values: Any) -> tuple[float | None, float | None]:
+def _range_of(axis: str, values: ArrayLike) -> tuple[float | None, float | None]:
     """Return the limits of an axis: a single value, as of an unfinished study, gives none."""
     low, high = float(np.min(values)), float(np.max(values))
     if axis == "flux_e":

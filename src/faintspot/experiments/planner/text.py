@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from faintspot.base.checks import not_none
 from faintspot.base.report.texts import Texts, plain_number, with_error
 from faintspot.base.statistics import Estimate
 from faintspot.experiments.methods import Knowledge
@@ -142,7 +143,7 @@ def _helps(gain: Estimate) -> bool:
 
 
 def _limit(answer: Answer, result: MethodResult) -> str:
-    limit: Any = result.limiting_flux_e
+    limit = not_none(result.limiting_flux_e)
     if limit.value == 0:
         return f"fainter than all that was tried ({_star(answer, answer.flux_e[0])})"
     if math.isinf(limit.value):

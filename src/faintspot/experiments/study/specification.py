@@ -56,7 +56,7 @@ _LARGEST = {"threshold_e": 100.0, "weight_fwhm_px": 100.0}  # others: 10
 _ABOVE_ZERO = ("noise_std", "smoothing_px", "weight_fwhm_px")
 
 
-def _checked_options(name: str, values: Any) -> dict[str, tuple[float, ...]]:
+def _checked_options(name: str, values: object) -> dict[str, tuple[float, ...]]:
     """Return the values of all options, those of `TRIED` where there are no others."""
     given = checked_table(name, values) if values != () else {}
     check_keys(f"{name}.", given, list(TRIED))

@@ -3,7 +3,7 @@
 import math
 from dataclasses import replace
 from functools import cache
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -123,7 +123,7 @@ def two_level_fraction(residuals: Floats) -> Floats:
 @cache
 def _one_level_limit(n: int) -> float:
     """Return the fraction below which n frames surely have two levels."""
-    normal: Any = np.random.default_rng(0).standard_normal((n, _TRIALS))
+    normal = np.random.default_rng(0).standard_normal((n, _TRIALS))
     fraction = two_level_fraction(normal)
     return float(fraction.mean() - _SURELY * fraction.std())
 

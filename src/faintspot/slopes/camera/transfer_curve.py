@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from itertools import pairwise
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import scipy
@@ -62,7 +62,9 @@ class LineFit(NamedTuple):
     scatter: float  # mean square of bright pixels about the line, 1 for normal noise
 
 
-def photon_transfer(frames: Floats, dark_level: Any, layout: Layout | None, order: int = 2) -> TransferCurve:
+def photon_transfer(
+    frames: Floats, dark_level: float | Floats, layout: Layout | None, order: int = 2
+) -> TransferCurve:
     """Return the variance of each pixel after removal of the common changes of its tile.
 
     The residual of a fit with orthonormal modes Q has the variance sum_j (1 - Q Q')_ij^2 v_j, which is
@@ -125,8 +127,8 @@ def fit_line(curve: TransferCurve) -> LineFit | None:
     # Weights must not follow the noise of faint pixels: below the typical flux they are equal.
     bright = max(float(np.sum(np.square(curve.mean)) / max(np.sum(np.abs(curve.mean)), 1e-300)), 0.0)
     typical = np.maximum(curve.mean, bright)
-    model: Any = np.full(n, np.inf)
-    scale: Any = np.ones(n)
+    model: Floats = np.full(n, np.inf)
+    scale: Floats = np.ones(n)
     for _ in range(_ITERATIONS):
         good = (curve.variance > 0) & (curve.variance < _LARGEST_EXCESS * model)
         weight = good / np.square(scale)

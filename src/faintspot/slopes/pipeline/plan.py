@@ -239,7 +239,7 @@ class Plan:
             np.float32(np.inf if pitch is None else min(LEAST_DIFFERENCE * pitch, LEAST_DIFFERENCE_PX)),
         )
 
-    def _fixed_table(self, per_subaperture: Any) -> NDArray[np.float32]:
+    def _fixed_table(self, per_subaperture: Callable[[str], NDArray[Any]]) -> NDArray[np.float32]:
         """Return the settings that do not depend on the flux."""
         sensor = self.sensor
         table = np.zeros((self.prepared.setting_rows, sensor.n), np.float32)

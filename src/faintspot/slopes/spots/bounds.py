@@ -6,6 +6,7 @@ a smaller error at low flux.
 
 import functools
 import math
+from collections.abc import Callable
 from typing import Any, NamedTuple, Unpack
 
 import numpy as np
@@ -300,7 +301,9 @@ def photon_efficiency(error_px: ArrayLike, flux_e: ArrayLike, **conditions: Any)
     return efficiency
 
 
-def _bracket(slope_error: Any, smallest: float, largest: float, start: float) -> tuple[float, float]:
+def _bracket(
+    slope_error: Callable[[Floats], Floats], smallest: float, largest: float, start: float
+) -> tuple[float, float]:
     """Return two fluxes with slope errors above `largest` and below `smallest`."""
     low = high = start
     while slope_error(np.array(low)) < 1.01 * largest:
@@ -325,7 +328,7 @@ def _positions(positions: object, position_range_px: float | None) -> Floats:
     return np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
 
 
-def _with_derivatives(render: Any, positions: Floats, step: float) -> _Spot:
+def _with_derivatives(render: Callable[[Floats], Floats], positions: Floats, step: float) -> _Spot:
     """Return images and their derivatives, for a flux of 1 e- in the window of a centred spot."""
     centred = float(np.sum(render(np.zeros((1, 2)))))
     if not centred > 0:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any, NamedTuple, TypedDict
+from typing import NamedTuple, TypedDict
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -51,7 +51,7 @@ class _Shapes(NamedTuple):
     width_across: Floats
     angle: Floats
 
-    def take(self, index: Any) -> _Shapes:
+    def take(self, index: slice | NDArray[np.generic]) -> _Shapes:
         return _Shapes(*(values[index] for values in self))
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 import scipy
@@ -45,7 +44,7 @@ class Stack:
         noise = self.excess_noise * max(float(background_e.mean()), 0.0)
         return replace(self, images=images, variance_e2=self.variance_e2 + noise)
 
-    def part(self, chosen: Any) -> Stack:
+    def part(self, chosen: slice | NDArray[np.generic]) -> Stack:
         """Return some of the spots."""
         usable = None if self.usable is None else self.usable[chosen]
         return replace(self, images=self.images[chosen], usable=usable)
@@ -113,7 +112,7 @@ class Registered:
         error: Floats = np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2))
         return error
 
-    def part(self, chosen: Any) -> Registered:
+    def part(self, chosen: slice | NDArray[np.generic]) -> Registered:
         """Return some of the spots."""
         return Registered(self.positions[chosen], self.flux_e[chosen], self.covariance[chosen])
 
