@@ -13,7 +13,6 @@ import warnings
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from types import MappingProxyType
 from typing import IO, Any, NamedTuple, cast
 
 import numpy as np
@@ -177,9 +176,7 @@ class HeaderDataUnit:
         return cls(index, name, header, compressed, shape, data_start)
 
 
-def write_images(
-    path: str | Path, images: Mapping[str, ArrayLike], units: Mapping[str, str] = MappingProxyType({})
-) -> None:
+def write_images(path: str | Path, images: Mapping[str, ArrayLike]) -> None:
     """Write arrays to a FITS file, each as an image of its own.
 
     Parameters
@@ -187,8 +184,6 @@ def write_images(
     path : path
     images : mapping
         Arrays by the names of their units.
-    units : mapping
-        Physical units (BUNIT) of some of them.
 
     Raises
     ------
@@ -200,12 +195,8 @@ def write_images(
     fits, stream = load_package("astropy.io.fits"), io.BytesIO()
     primary = fits.PrimaryHDU()
     primary.header["CREATOR"] = "faintspot"
-    hdus = [primary]
-    for name, values in images.items():
-        hdus.append(fits.ImageHDU(np.atleast_1d(values), name=name))
-        if name in units:
-            hdus[-1].header["BUNIT"] = units[name]
-    fits.HDUList(hdus).writeto(stream, checksum=True)
+    hdus = [fits.ImageHDU(np.atleast_1d(values), name=name) for name, values in images.items()]
+    fits.HDUList([primary, *hdus]).writeto(stream, checksum=True)
     write_atomically(path, stream.getvalue())
 
 

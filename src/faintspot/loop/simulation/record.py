@@ -30,7 +30,7 @@ class LoopRecord(NpzFile):
     """One run of `simulate_loop`, n sub-apertures and m commands."""
 
     WHAT: ClassVar[str] = "a record of a loop"
-    FORMAT: ClassVar[int] = 4
+    FORMAT: ClassVar[int] = 5
 
     slopes_px: NDArray[np.float32]
     """(frames, 2 n): all x, then all y, from the reference, before division by a centroid gain."""
@@ -46,8 +46,6 @@ class LoopRecord(NpzFile):
     """(frames,): Strehl ratio of each frame at the science wavelength, on axis."""
     residual_nm: NDArray[np.float64]
     """(frames,): rms of the residual wavefront."""
-    zernike_nm: NDArray[np.float32]
-    """(frames, 10): Zernike modes 2 to 11 (Noll) of the residual wavefront."""
     r0_m: NDArray[np.float64]
     """(frames,): true Fried parameter at 500 nm."""
     method: NDArray[np.int8]

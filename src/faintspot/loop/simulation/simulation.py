@@ -150,7 +150,6 @@ class _Loop:
             "standard_error_px": np.zeros((frames, 2 * n), np.float32),
             "covariance_xy_px2": np.zeros((frames, n), np.float32),
             "commands": np.zeros((frames, optics.mirror.commands), np.float32),
-            "zernike_nm": np.zeros((frames, 10), np.float32),
             **{name: np.zeros(frames) for name in ("strehl", "residual_nm", "r0_m")},
         }
         """Values of each frame, by their names in `LoopRecord`."""
@@ -213,9 +212,8 @@ class _Loop:
 
     def _observe(self, frame: int, time: float, wavefront: NDArray[np.float32]) -> None:
         """Record the true values."""
-        truth, zernike = self.telescope_model.truth(time, wavefront), self.optics.pupil.zernike(wavefront)
-        true = {"strehl": truth.strehl, "residual_nm": truth.rms_nm, "r0_m": truth.r0_m}
-        self._note(frame, zernike_nm=zernike, **true)
+        truth = self.telescope_model.truth(time, wavefront)
+        self._note(frame, strehl=truth.strehl, residual_nm=truth.rms_nm, r0_m=truth.r0_m)
 
     def _note(self, frame: int, **values: ArrayLike) -> None:
         for name, value in values.items():

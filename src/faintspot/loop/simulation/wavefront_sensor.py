@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import dataclass
-from functools import cached_property
 from types import ModuleType
 from typing import Any, NamedTuple
 
@@ -12,7 +11,6 @@ from numpy.typing import NDArray
 from faintspot.base.errors import InputError, MissingExtraError
 from faintspot.loop.simulation.configuration import LoopConfiguration, blur_px
 from faintspot.slopes.sensor.layout import Layout
-from faintspot.slopes.wavefront.zernike import zernike
 
 _SUPERSAMPLING = 8
 
@@ -41,22 +39,6 @@ class PupilAmplitude:
         weights = self.amplitude / self.amplitude.sum()
         mean = float(np.vdot(weights, wavefront))
         return float(np.sqrt(max(0.0, float(np.vdot(weights, wavefront * wavefront)) - mean**2)))
-
-    def zernike(self, wavefront: NDArray[np.floating]) -> NDArray[np.float32]:
-        """Return Zernike modes 2 to 11 (Noll) of a wavefront (n, n) over the pupil, in its unit: (10,)."""
-        modes: NDArray[np.float32] = self._to_zernike @ wavefront.ravel()
-        return modes
-
-    @cached_property
-    def _to_zernike(self) -> NDArray[np.float32]:
-        """Weighted least-squares fit of piston and the modes, without the row of piston."""
-        line = (np.arange(self.points) + 0.5) / self.points - 0.5
-        lit = self.amplitude.ravel() > 0.5
-        x, y = (coordinate.ravel() for coordinate in np.meshgrid(line, line))
-        radius = float(np.hypot(x, y)[lit].max())
-        modes = np.stack([zernike(mode, x / radius, y / radius) for mode in range(1, 12)])
-        weighted = modes * self.amplitude.ravel()
-        return np.linalg.solve(weighted @ modes.T, weighted)[1:].astype(np.float32)
 
     def field(self, wavefront_nm: NDArray[np.floating], wavelength_m: float) -> NDArray[np.complex64]:
         """Return the complex amplitude (n, n) of a wavefront at a wavelength."""
