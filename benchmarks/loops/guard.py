@@ -20,7 +20,7 @@ from benchmarks.measuring import Row, Table
 from faintspot.base.statistics import paired_mean
 from faintspot.loop.control.flattening import residual_phase
 from faintspot.loop.control.identification.layers import Identified
-from faintspot.loop.control.identification.learnt_loop import ObservedLoop, learn_observed
+from faintspot.loop.control.identification.learnt_loop import ObservedLoop, control_from_observed
 from faintspot.loop.control.identification.loop_delay import LoopDelay
 from faintspot.loop.control.identification.open_loop import open_loop_of
 from faintspot.loop.control.identification.predictive_control import PredictiveControl, learn
@@ -240,7 +240,7 @@ def learnt(
     delay = LoopDelay(float(DELAY), 0.06, factor * CENTROID_GAIN, 0.04)
     ready = prepared(recorded(flux_e, loop_gain))
     return PredictiveControl(
-        *learn_observed(ObservedLoop(ready, delay, open_loop_of(ready.recording, delay)), start)
+        *control_from_observed(ObservedLoop(ready, delay, open_loop_of(ready.recording, delay)), start)
     )
 
 

@@ -88,7 +88,7 @@ def learn_controller(
     gain, plain_residual = plant.best_gain(GAINS, part, of_commands @ plant.reconstructor.matrix)
     model = Kalman({}, gain, 1.0, (math.inf, plain_residual), of_commands)
     known = Identification(telemetry, site, rate_hz) if identification is None else identification
-    return model.learnt(plant, part, _fits(known.among(AVERAGED[:1]), site, winds, start), progress)
+    return model.best_of(plant, part, _fits(known.among(AVERAGED[:1]), site, winds, start), progress)
 
 
 def replayed_part(telemetry: OpenLoopTelemetry, slopes: int) -> OpenLoopTelemetry:

@@ -15,7 +15,7 @@ from faintspot.loop.control.identification.modal_delay import modes_of
 from faintspot.loop.control.identification.modal_model import (
     LoopInModes,
     LoopOfControl,
-    learn_modes,
+    fit_modal_filter,
     share_of_modes,
 )
 from faintspot.loop.control.identification.model import Kalman
@@ -37,7 +37,7 @@ _CORRECTIONS = 2  # of the matrix, each followed by learning
 _CLEARLY = 0.9  # part of what winds leave, below which modes alone replace them
 
 
-def learn_loop(recording: Recording, start: Identified | None) -> tuple[LoopOfControl, Kalman]:
+def control_from_recording(recording: Recording, start: Identified | None) -> tuple[LoopOfControl, Kalman]:
     """Learn the loop and the filter of a controller; see `predictive_control.learn`."""
     if recording.commands is None or recording.interaction_matrix is None:
         absent = "commands" if recording.commands is None else "interaction_matrix"
@@ -47,7 +47,7 @@ def learn_loop(recording: Recording, start: Identified | None) -> tuple[LoopOfCo
     if loop.cells is None or len(loop.cells) < FEWEST_SUBAPERTURES:
         measured, used = measured_delay(modes_of(loop).recording)
         return _in_modes(ready, LoopInModes.of(ready, replace(used, delay_error=measured.delay_error)))
-    return learn_observed(_observed(ready), start)
+    return control_from_observed(_observed(ready), start)
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,13 +64,13 @@ class ObservedLoop:
     """Interaction matrix of `ready` before it was corrected; or empty."""
 
 
-def learn_winds_again(recording: Recording, like: LoopOfControl) -> tuple[LoopOfControl, Kalman]:
+def control_with_new_winds(recording: Recording, like: LoopOfControl) -> tuple[LoopOfControl, Kalman]:
     """Learn the winds, and the centroid gain, of a loop whose delay, mirror and axes are known.
 
     Raises
     ------
     InputError
-        As `learn_loop`.
+        As `control_from_recording`.
     """
     ready = prepared(recording)
     _, used = measured_delay(ready.recording)
@@ -81,7 +81,9 @@ def learn_winds_again(recording: Recording, like: LoopOfControl) -> tuple[LoopOf
     return _controlling(_with_found_winds(described, learnt), ready, observed.seen, learnt)
 
 
-def learn_observed(observed: ObservedLoop, start: Identified | None = None) -> tuple[LoopOfControl, Kalman]:
+def control_from_observed(
+    observed: ObservedLoop, start: Identified | None = None
+) -> tuple[LoopOfControl, Kalman]:
     """Learn as `learn` from a recording whose delay and open-loop slopes are known."""
     (described, learnt), recorded = _with_winds(observed, start), observed
     if not learnt.is_local:
@@ -167,7 +169,7 @@ def _corrected(
 
 def _in_modes(ready: Prepared, modes: LoopInModes) -> tuple[LoopOfControl, Kalman]:
     """Learn from modes alone."""
-    learnt = learn_modes(modes)
+    learnt = fit_modal_filter(modes)
     return _controlling(modes.described, ready, modes.seen, learnt)
 
 

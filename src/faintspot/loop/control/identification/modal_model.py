@@ -199,7 +199,7 @@ class LoopInModes:
 Kind = Callable[[Kalman, LoopPlant, OpenLoopTelemetry, LoopInModes], Kalman]
 
 
-def learn_modes(
+def fit_modal_filter(
     modes: LoopInModes, telemetry: OpenLoopTelemetry | None = None, of_commands: Floats | None = None
 ) -> Kalman:
     """Return a filter of modes: autoregressions or, of two modes, oscillators.
@@ -258,7 +258,7 @@ def _oscillators(model: Kalman, plant: LoopPlant, telemetry: OpenLoopTelemetry, 
     rate_hz = loop.described.recorded.frame_rate_hz
     single = LoopSystem(None, np.zeros((1, 2)), rate_hz)
     fit = Identification(telemetry, single.site, rate_hz).layers()
-    return model.learnt(plant, telemetry, [fit])
+    return model.best_of(plant, telemetry, [fit])
 
 
 def best_orders(modes: Floats, frames: int) -> NDArray[np.int64]:
@@ -352,6 +352,6 @@ def share_of_modes(modes: LoopInModes, winds: Kalman, plant: LoopPlant, seen: Op
     """
     own, telemetry = modes.described.plant(), modes.seen.telemetry
     first = len(telemetry) - round(JUDGED_PART * len(telemetry))
-    learnt = learn_modes(modes, telemetry.part(0, first), winds.phase_of_commands)
+    learnt = fit_modal_filter(modes, telemetry.part(0, first), winds.phase_of_commands)
     left = learnt.scored(own, telemetry.part(first, None)).left[0]
     return left / winds.scored(plant, seen.telemetry.part(first, None)).left[0]

@@ -86,7 +86,7 @@ class Kalman:
     identified: Identified | None = None
     """Turbulence that the model follows from; None for models read from a file."""
 
-    def learnt(
+    def best_of(
         self,
         plant: LoopPlant,
         telemetry: OpenLoopTelemetry,

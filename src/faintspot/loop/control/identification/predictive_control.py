@@ -25,9 +25,9 @@ from faintspot.loop.control.identification.learning import (
 )
 from faintspot.loop.control.identification.learnt_loop import (
     ObservedLoop,
-    learn_loop,
-    learn_observed,
-    learn_winds_again,
+    control_from_observed,
+    control_from_recording,
+    control_with_new_winds,
 )
 from faintspot.loop.control.identification.loop_delay import LoopDelay
 from faintspot.loop.control.identification.modal_delay import LEAST_MEASURED
@@ -68,7 +68,7 @@ class PredictiveControl:
     @classmethod
     def of(cls, observed: ObservedLoop) -> PredictiveControl:
         """Learn a controller from a recording whose delay and open-loop slopes are known."""
-        return cls(*learn_observed(observed))
+        return cls(*control_from_observed(observed))
 
     @property
     def delay_frames(self) -> Measured:
@@ -261,7 +261,7 @@ class PredictiveControl:
         new = (
             learn(part)
             if self._loop.analysis.size
-            else PredictiveControl(*learn_winds_again(part, self._loop))
+            else PredictiveControl(*control_with_new_winds(part, self._loop))
         )
         loop, begin = new._loop, max(0, first - SETTLE_FRAMES)
         rest, delay = recording.part(slice(begin, None)), new._plant.delay_frames
@@ -443,4 +443,4 @@ def learn(recording: Recording, start: Identified | None = None) -> PredictiveCo
     >>> control(slopes[0]).shape
     (16,)
     """
-    return PredictiveControl(*learn_loop(recording, start))
+    return PredictiveControl(*control_from_recording(recording, start))
