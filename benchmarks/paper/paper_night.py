@@ -24,7 +24,7 @@ from faintspot.experiments.night.paper import (
     paper_exposures,
     set_columns,
 )
-from faintspot.experiments.night.protocol import NIGHT_STORE, Night, load_night
+from faintspot.experiments.night.protocol import NIGHT_FILE, Night
 from faintspot.experiments.paper.claims import paper_rows
 
 Tables = dict[str, dict[str, Any]]
@@ -37,7 +37,7 @@ _COMMAND = "faintspot loop night canary, and with --unit counts; python -m bench
 @click.argument("counts", type=_FOLDER)
 def run_command(electrons: Path, counts: Path) -> None:
     """Store the tables of two finished nights for the documentation, and print what they say."""
-    nights = load_night(electrons / NIGHT_STORE), load_night(counts / NIGHT_STORE)
+    nights = Night.load(electrons / NIGHT_FILE), Night.load(counts / NIGHT_FILE)
     click.echo(publish(*nights))
     for night in nights:
         click.echo("\n".join([f"[{night.strength_unit}]", *paper_sentences(night)]))

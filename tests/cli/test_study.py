@@ -18,7 +18,7 @@ from faintspot.experiments import run as run_study
 from faintspot.experiments.closed_loop import magnitude
 from faintspot.experiments.closed_loop.results import MagnitudeResult
 from faintspot.experiments.night import page, protocol
-from faintspot.experiments.night.protocol import NightPlan, load_night
+from faintspot.experiments.night.protocol import Night, NightPlan
 from faintspot.experiments.study import specification as estimators
 from faintspot.loop.control.configuration import load_control
 from faintspot.loop.simulation.configuration import LoopConfiguration, load_loop, shipped_loops
@@ -145,7 +145,7 @@ def test_night_says_its_verdict_and_repeats_nothing(run: Commands, monkeypatch: 
     assert lines[0].startswith("TV raises the mean Strehl ratio")
     assert lines[-1] == "small-night-quick/night.html: open it in a browser"
     assert any(line.startswith("Gaussian smoothing") for line in lines)
-    assert load_night("small-night-quick/night.zarr").labels[1:3] == ("TV 0.7 e-", "TV 1.5 e-")
+    assert Night.load("small-night-quick/night.npz").labels[1:3] == ("TV 0.7 e-", "TV 1.5 e-")
     assert json.loads(Path("small-night-quick/night.json").read_text(encoding="utf-8"))["verdicts"]
     again = run(*arguments, "--methods", "none,tv,smoothed", "--strengths", "0.7,1.5")
     assert again.out == result.out  # nothing was done again

@@ -326,7 +326,8 @@ class NpzFile:
         """
         values = read_arrays(path, cls.WHAT, cls._names() if cls.FORMAT is None else None, cls.OPTIONAL)
         version = values.pop("format", None)
-        if cls.FORMAT is not None and (version != cls.FORMAT or set(values) != set(cls._names())):
+        has_all = {*values, *cls.OPTIONAL} == {*cls._names(), *cls.OPTIONAL}
+        if cls.FORMAT is not None and (version != cls.FORMAT or not has_all):
             raise InputError(f"{path}: expected {cls.WHAT} of format {cls.FORMAT}, got something else")
         with errors_within(path):
             return cls(**{name: _restored(value) for name, value in values.items()})

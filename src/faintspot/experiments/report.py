@@ -16,7 +16,7 @@ from faintspot.base.report.plots import Line, Panel, draw
 from faintspot.base.report.texts import Texts
 from faintspot.experiments.methods import knows_the_spot, label_of, style_of
 from faintspot.experiments.night.page import night_sections
-from faintspot.experiments.night.protocol import NIGHT_STORE, Night, load_night
+from faintspot.experiments.night.protocol import NIGHT_FILE, Night
 from faintspot.experiments.paper import claims
 from faintspot.experiments.paper.figures import (
     axis_of_study,
@@ -148,8 +148,8 @@ def report_of_study(path: str | Path) -> Report:
     """
     from faintspot.experiments.study.run import open_study
 
-    store = night_folder(path) / NIGHT_STORE
-    return study_report(open_study(path), load_night(store) if store.exists() else None)
+    file = night_folder(path) / NIGHT_FILE
+    return study_report(open_study(path), Night.load(file) if file.exists() else None)
 
 
 def night_folder(path: str | Path) -> Path:

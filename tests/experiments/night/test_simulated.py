@@ -7,7 +7,7 @@ from tests.experiments.experiment_cases import HERE, StopsAfter, assert_same_fil
 from tests.refusals import refused
 from tests.shared_data import skip_without
 
-from faintspot.experiments.night.protocol import NightPlan, load_night
+from faintspot.experiments.night.protocol import Night, NightPlan
 from faintspot.experiments.night.simulated import r0_of_slopes, run_night
 from faintspot.experiments.running import WorkerPool
 from faintspot.loop.simulation import simulate_loop
@@ -69,7 +69,7 @@ def test_a_night_is_what_the_loop_does(tmp_path: Path) -> None:
     assert ((night.r0_m > 0.3 * night.true_r0_m) & (night.r0_m < 3 * night.true_r0_m))[
         np.isfinite(night.r0_m)
     ].all()
-    np.testing.assert_array_equal(load_night(tmp_path / "night.zarr").strehl, night.strehl)
+    np.testing.assert_array_equal(Night.load(tmp_path / "night.npz").strehl, night.strehl)
 
 
 @pytest.mark.slow

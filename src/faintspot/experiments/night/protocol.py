@@ -1,22 +1,18 @@
 """Protocol of alternating observations, and a night: one row for each block of frames of one method."""
 
 import math
-import shutil
-from dataclasses import dataclass, fields, replace
-from pathlib import Path
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.arrays import Floats
 from faintspot.base.checks import number_between
-from faintspot.base.errors import InputError, load_package
-from faintspot.base.files import output_errors
+from faintspot.base.errors import InputError
+from faintspot.base.files import NpzFile
 from faintspot.base.options import LIST, TEXTS, Options, number, setting
 from faintspot.experiments.closed_loop.results import with_choice
-from faintspot.io.stored_array import one_line
-from faintspot.io.zarr_store import new_store
 from faintspot.loop.control.base import INTEGRATOR
 from faintspot.loop.simulation.configuration import LoopConfiguration
 from faintspot.loop.simulation.methods import UNCORRECTED, Method
@@ -186,18 +182,21 @@ QUICK_PLAN = NightPlan(
 )
 
 
-NIGHT_STORE = "night.zarr"
-"""Name of the store in a folder of results."""
-_FORMAT = 1
+NIGHT_FILE = "night.npz"
+"""Name of the file in a folder of results."""
 
 
 @dataclass(frozen=True, eq=False)
-class Night:
+class Night(NpzFile):
     """Blocks of a night in the order of time; arrays are (B,) unless stated otherwise. NaN: not known.
 
     A block is a stretch of frames that one method measured, without the frames in which the loop settled.
     Sets are stretches of the night with the same conditions, such as the multiplication gain of the camera.
     """
+
+    WHAT: ClassVar[str] = "a night"
+    FORMAT: ClassVar[int] = 2
+    OPTIONAL: ClassVar[tuple[str, ...]] = ("counts_per_e", "shared_error")
 
     labels: tuple[str, ...]
     """(M,): names of the methods."""
@@ -301,50 +300,6 @@ class Night:
         new_set = np.diff(self.set_number, prepend=self.set_number[:1] - 1) != 0
         return np.cumsum(new_set | self.is_reference) - 1
 
-    def save(self, path: str | Path) -> None:
-        """Write the night as a Zarr store, which xarray opens with one dimension, `block`.
-
-        Raises
-        ------
-        InputError
-            When it cannot be written.
-        MissingExtraError
-            When zarr is not installed.
-        """
-        path, arrays = Path(path), self._arrays()
-        others = {name: value for name, value in vars(self).items() if name not in arrays}
-        with output_errors(path), new_store(path, {"night_format": _FORMAT, **others}) as group:
-            for name, values in arrays.items():
-                group.create_array(name, data=values, dimension_names=("block",))
-            shutil.rmtree(path, ignore_errors=True)
-
     def _arrays(self) -> dict[str, NDArray[np.generic]]:
         """Return the arrays by name."""
         return {name: value for name, value in vars(self).items() if isinstance(value, np.ndarray)}
-
-
-def load_night(path: str | Path) -> Night:
-    """Read what `Night.save` wrote.
-
-    Raises
-    ------
-    InputError
-        When it cannot be read, or is something else.
-    MissingExtraError
-        When zarr is not installed.
-    """
-    zarr = load_package("zarr")
-    try:
-        group = zarr.open_group(str(path), mode="r")
-        attributes = dict(group.attrs)
-        columns = {name: np.asarray(array[:]) for name, array in group.arrays()}
-    except Exception as error:  # each kind of damage makes zarr raise another error
-        raise InputError(f"{path}: cannot be read as a night ({one_line(error)})") from None
-    if attributes.pop("night_format", None) != _FORMAT or {*attributes, *columns} != {
-        item.name for item in fields(Night)
-    }:
-        raise InputError(f"{path}: expected a night of format {_FORMAT}, got something else")
-    values: dict[str, Any] = {**attributes, **columns}
-    for name in ("labels", "settings", "set_names"):
-        values[name] = tuple(values[name])
-    return Night(**values)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.arrays import Floats
-from faintspot.experiments.night.protocol import NIGHT_STORE, QUICK_PLAN, Night, NightPlan, counts_per_e
+from faintspot.experiments.night.protocol import NIGHT_FILE, QUICK_PLAN, Night, NightPlan, counts_per_e
 from faintspot.experiments.running import Advance, Unit, WorkerPool, run_units
 from faintspot.experiments.store import UnitStore, ZarrStore, fingerprint_of
 from faintspot.loop.simulation.configuration import LoopConfiguration
@@ -122,7 +122,7 @@ def run_night(
         overwrite=overwrite,
     )
     night = _night(configuration, plan, run_units(observe, units, store, pool))
-    night.save(folder / NIGHT_STORE)
+    night.save(folder / NIGHT_FILE)
     return night
 
 
