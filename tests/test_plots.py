@@ -19,8 +19,15 @@ from faintspot.slopes.simulate import sensor_frames
 LAYOUT = fs.Layout.grid((6, 6), pixels=12)
 FRAMES, _ = sensor_frames(LAYOUT, 3, flux_e=500.0, rng=np.random.default_rng(1))
 FRAMES[:, :12, :12] = 0.0
-PIPELINE = fs.SlopePipeline(LAYOUT, fs.Settings("brightest", keep_brightest=12))
-SLOPES = PIPELINE(FRAMES)
+
+
+def measured(frames: Any) -> fs.Slopes:
+    return fs.SlopePipeline(LAYOUT, fs.Settings("brightest", keep_brightest=12))(frames)
+
+
+@pytest.fixture(scope="module")
+def slopes() -> fs.Slopes:
+    return measured(FRAMES)
 
 
 @pytest.fixture
@@ -52,8 +59,9 @@ def test_a_layout_draws_its_windows_on_a_frame_or_alone(axes: Axes) -> None:
         LAYOUT.plot(FRAMES[:, 1:])
 
 
-@pytest.mark.parametrize("slopes", [SLOPES, PIPELINE(FRAMES[0])], ids=["frames", "frame"])
-def test_slopes_are_arrows_at_valid_sub_apertures(axes: Axes, slopes: fs.Slopes) -> None:
+@pytest.mark.parametrize("frames", [FRAMES, FRAMES[0]], ids=["frames", "frame"])
+def test_slopes_are_arrows_at_valid_sub_apertures(axes: Axes, frames: Any) -> None:
+    slopes = measured(frames)
     assert slopes.plot(axes) is axes
     (arrows,) = of_kind(axes, Quiver)
     valid = np.atleast_2d(slopes.valid)
@@ -63,17 +71,17 @@ def test_slopes_are_arrows_at_valid_sub_apertures(axes: Axes, slopes: fs.Slopes)
     assert np.corrcoef(arrows.U, mean)[0, 1] > 0.99  # the longest are cut
 
 
-def test_slopes_without_a_layout_need_one(axes: Axes) -> None:
-    unknown = replace(SLOPES, layout=None)
+def test_slopes_without_a_layout_need_one(axes: Axes, slopes: fs.Slopes) -> None:
+    unknown = replace(slopes, layout=None)
     with refused("layout"):
         unknown.plot(axes)
     with refused("layout"):
-        SLOPES.plot(axes, layout=LAYOUT[:5])
+        slopes.plot(axes, layout=LAYOUT[:5])
     assert unknown.plot(axes, layout=LAYOUT) is axes
 
 
-def test_a_wavefront_is_drawn_over_its_pupil_with_and_without_tilt(axes: Axes) -> None:
-    tilted = fs.Slopes.from_variables({**SLOPES.variables, "x": SLOPES.x + 1}, layout=LAYOUT)
+def test_a_wavefront_is_drawn_over_its_pupil_with_and_without_tilt(axes: Axes, slopes: fs.Slopes) -> None:
+    tilted = fs.Slopes.from_variables({**slopes.variables, "x": slopes.x + 1}, layout=LAYOUT)
     wavefront = fs.fit_wavefront(tilted, LAYOUT, modes=6)
     for tilt in (True, False):
         sheet: Any = np.ma.filled(

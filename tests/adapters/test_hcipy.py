@@ -7,16 +7,25 @@ from tests.refusals import refused
 
 import faintspot as fs
 from faintspot import InputError, Settings
+from faintspot.base.flags import INVALID
 
-hcipy = pytest.importorskip("hcipy", reason="hcipy is not installed (extra loop)")
+pytestmark = pytest.mark.slow  # the import of HCIPy, in every process
 
-from faintspot.adapters.hcipy import SlopeEstimator  # noqa: E402
-from faintspot.base.flags import INVALID  # noqa: E402
+hcipy: Any
+SlopeEstimator: Any
 
 SIDE, LENSLETS, WIDTH_M, WAVELENGTH_M, F_NUMBER = 12, 7, 4.2e-3, 0.7e-6, 150.0
 PIXEL_M = WIDTH_M / (LENSLETS * SIDE)
 EVERYTHING = Settings("brightest", keep_brightest=SIDE * SIDE, rule="threshold")  # as HCIPy's own
 FAINT = Settings(noise_std=1.0, keep_brightest=20)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def imported() -> None:
+    """Import HCIPy when the first test runs, not where tests are listed."""
+    global hcipy, SlopeEstimator
+    hcipy = pytest.importorskip("hcipy", reason="hcipy is not installed (extra loop)")
+    from faintspot.adapters.hcipy import SlopeEstimator
 
 
 def sensor(pixels: int = LENSLETS * SIDE, shift_px: float = 0.0) -> Any:
@@ -90,7 +99,6 @@ def test_lenslets_that_are_not_a_whole_number_of_pixels_wide() -> None:
         np.testing.assert_allclose(slopes[axis], expected, rtol=0, atol=1e-5 * PIXEL_M)
 
 
-@pytest.mark.slow
 def test_fits_into_hcipys_sensor_and_takes_what_it_takes(optics: Any) -> None:
     first = SlopeEstimator(optics.mla_grid, optics.mla_index, settings=FAINT)
     assert isinstance(first, hcipy.WavefrontSensorEstimator)

@@ -65,6 +65,7 @@ def test_osa_indices_are_those_of_the_standard() -> None:
     assert [index for index, _, _ in ours] == list(range(66))
 
 
+@pytest.mark.slow  # the import of HCIPy
 def test_indices_and_modes_are_those_of_hcipy() -> None:
     hcipy = pytest.importorskip("hcipy")
     grid = hcipy.CartesianGrid(hcipy.SeparatedCoords([np.linspace(-0.7, 0.7, 8)] * 2))
