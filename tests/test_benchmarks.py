@@ -33,6 +33,7 @@ def test_scikit_image_converges_to_the_same_positions(case: rivals.Problem) -> N
     assert rivals.skimage_difference(case, count=2) <= rivals.SAME_SOLUTION_PX
 
 
+@pytest.mark.slow
 def test_layouts_are_judged_by_the_truth() -> None:
     array = simulated_arrays.plain_small(1)[0]
     assert layouts.verdict(array) == ("right", "")

@@ -86,7 +86,7 @@ def test_slopes_do_not_depend_on_the_unit_of_the_frames(folder: Path, run: Comma
     assert settings[0] == settings[1] == settings[2]
 
 
-@pytest.mark.usefixtures("no_trials")
+@pytest.mark.usefixtures("no_trials", "coarse_pictures")
 def test_options_are_used_or_refused(folder: Path, run: Commands) -> None:
     np.savez("a b.npz", night=frames(), day=frames())
     result = run.ok(

@@ -70,6 +70,7 @@ def test_background_beyond_a_stated_dark_is_reported(folder: Path, run: Commands
     assert known.settings.spot_fwhm_px == pytest.approx(4.7, rel=0.15)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("no_trials")
 def test_spots_too_wide_for_the_largest_window_are_binned(folder: Path, run: Commands) -> None:
     """FWHM of 54 px at a pitch of 90 px: windows of 64 px would cut them."""

@@ -221,7 +221,7 @@ def first_choice(name: str) -> dict[str, Any]:
 BRIGHT = small().replace("camera", photons_per_subaperture=1000.0)
 
 
-@pytest.mark.parametrize("name", mostly_slow(4, NAMES))
+@pytest.mark.parametrize("name", mostly_slow(2, NAMES))
 def test_every_method_closes_the_loop(name: str) -> None:
     """Not for long and not well, but better than no correction: Strehl ratio 0.17 then."""
     kind = Method.named(name)

@@ -127,6 +127,7 @@ def test_no_difference_is_called_worse_in_five_per_cent_of_studies() -> None:
     assert alarms <= 12
 
 
+@pytest.mark.slow
 def test_verdicts_are_the_same_for_the_same_study() -> None:
     assert verdicts(study(lambda cell: 1.2)) == verdicts_of(1.2)
 

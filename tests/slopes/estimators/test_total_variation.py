@@ -14,7 +14,7 @@ import faintspot as fs
 
 ALGORITHMS = ("fgp", "chambolle")
 DTYPES = (np.float32, np.float64)
-KERNELS = [(np.float32, "fgp"), (np.float64, "fgp"), (np.float64, "chambolle"), (np.float32, "chambolle")]
+KERNELS = [(np.float32, "fgp"), (np.float64, "chambolle"), (np.float64, "fgp"), (np.float32, "chambolle")]
 # Rounding: the kernels stay within 5 epsilon of max|g| on ordinary images. Outliers, 64 x 64 pixels and
 # strengths near the image's own rms add a factor.
 ROUNDINGS = 60
@@ -23,7 +23,7 @@ MARGIN = 1e-3
 
 fractions = st.one_of(st.just(0.0), st.floats(1e-3, 0.98), st.sampled_from([0.98, 1.02, 1.5, 1e3]))
 every_algorithm = pytest.mark.parametrize("algorithm", ALGORITHMS)
-every_kernel = pytest.mark.parametrize(("dtype", "algorithm"), mostly_slow(3, KERNELS))
+every_kernel = pytest.mark.parametrize(("dtype", "algorithm"), mostly_slow(2, KERNELS))
 every_dtype = pytest.mark.parametrize("dtype", DTYPES)
 
 
@@ -147,10 +147,10 @@ class TestSolution:
 
 class TestSpecialCases:
     @every_dtype
-    @pytest.mark.parametrize("value", [0.0, 1.0, -3.5, 1e25, -1e-30, 1e-42])
     @pytest.mark.parametrize("strength", [0.0, 0.5, 1e10])
-    def test_constant_images_return_themselves(self, dtype: Any, value: float, strength: float) -> None:
-        g = np.full((3, 5, 4), value, dtype)
+    def test_constant_images_return_themselves(self, dtype: Any, strength: float) -> None:
+        values = np.array([0.0, 1.0, -3.5, 1e25, -1e-30, 1e-42], dtype)
+        g = np.broadcast_to(values[:, None, None], (6, 5, 4)).copy()
         result = fs.tv_denoise(g, strength, full_output=True)
         assert np.array_equal(result.images, g)
         assert np.all(result.iterations == 0)

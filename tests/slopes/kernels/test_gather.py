@@ -2,13 +2,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tests.patience import mostly_slow
 
 from faintspot.slopes.kernels.gather import Frames, gather_raw
 from faintspot.slopes.kernels.host import aligned_zeros, lanes_for
 
 
 @pytest.mark.parametrize("dtype", [np.uint16, np.float32])
-@pytest.mark.parametrize("width", [16, 8, 4])
+@pytest.mark.parametrize("width", mostly_slow(1, [8, 16, 4]))
 @pytest.mark.parametrize("window", [(16, 16), (8, 8), (10, 10), (7, 9), (5, 20), (2, 2), (1, 1)])
 def test_gathered_windows_equal_slices(window: tuple[int, int], width: int, dtype: Any) -> None:
     """Also of windows that SIMD lanes stick out of, in the last corner of the last frame."""

@@ -28,7 +28,7 @@ def share_of_wrong(record: Recording, slopes: fs.Slopes) -> float:
 @pytest.mark.parametrize(
     "case",
     mostly_slow(
-        2,
+        1,
         [
             Case(frames=20),
             Case(frames=20, geometry="hexagonal"),

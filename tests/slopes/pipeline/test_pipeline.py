@@ -19,7 +19,7 @@ DTYPES = ("uint8", "uint16", "int16", "int32", "float32", "float64", ">u2", ">f4
 class TestAgainstOracle:
     @pytest.mark.parametrize("dtype", DTYPES)
     @given(seed=st.integers(0, 2**32 - 1))
-    @examples(4)
+    @examples(2)
     def test_random_sensors_equal_the_oracle(self, dtype: str, seed: int) -> None:
         case = random_case(seed, dtype)
         assert_equals_oracle(case, case.pipeline()(case.frame))
@@ -41,7 +41,7 @@ class TestAgainstOracle:
     def test_comparison_is_not_empty(self) -> None:
         """Most random sub-apertures hold a spot that is compared."""
         valid: list[bool] = []
-        for seed in range(30):
+        for seed in range(10):
             case = random_case(seed, "uint16")
             valid.extend(case.pipeline()(case.frame).valid)
         assert np.mean(valid) > 0.5

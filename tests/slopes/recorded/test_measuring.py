@@ -57,7 +57,7 @@ def test_blocks_and_progress(made: Recording) -> None:
 
 @pytest.mark.parametrize(
     ("name", "stops"),
-    mostly_slow(2, [("s.zarr", (1,)), ("s.fits", (7, 20)), ("s.npz", (30,)), ("s.csv", (30,))]),
+    mostly_slow(1, [("s.zarr", (1,)), ("s.fits", (7, 20)), ("s.npz", (30,)), ("s.csv", (30,))]),
 )
 def test_stopped_anywhere_it_goes_on(made: Recording, name: str, stops: tuple[int, ...]) -> None:
     pytest.importorskip("zarr")
@@ -75,7 +75,7 @@ def test_stopped_anywhere_it_goes_on(made: Recording, name: str, stops: tuple[in
 @pytest.mark.parametrize(
     "change",
     mostly_slow(
-        2,
+        1,
         [
             {"denoise": False},
             {"reference": np.full((16, 2), 0.1)},

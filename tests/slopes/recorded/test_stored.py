@@ -101,7 +101,7 @@ def test_stores_of_different_sensors_are_refused_in_one_line(tmp_path: Path) -> 
 @pytest.mark.parametrize(
     ("name", "changes", "words"),
     mostly_slow(
-        2,
+        1,
         [
             (
                 "s.csv",

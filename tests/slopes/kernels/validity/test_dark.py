@@ -40,7 +40,7 @@ def no_flux(slopes: fs.Slopes) -> NDArray[np.bool_]:
 
 class TestAgainstOracle:
     @given(seed=st.integers(0, 2**32 - 1))
-    @examples(10)
+    @examples(6)
     def test_random_and_hostile_frames(self, seed: int) -> None:
         rng = np.random.default_rng(seed)
         window = int(rng.integers(3, 21)), int(rng.integers(3, 21))

@@ -18,7 +18,7 @@ WIDTHS = [(30, 5.2, 0.15), (12, 8.0, 0.2), (4, 100.0, 0.02), (4, 60.0, 0.2), (5,
 @pytest.mark.parametrize(
     "sensor",
     mostly_slow(
-        4,
+        2,
         [
             {},
             {"geometry": "hexagonal"},

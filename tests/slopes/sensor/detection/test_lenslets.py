@@ -70,7 +70,7 @@ def spots_at(positions: list[tuple[int, int]]) -> NDArray[np.float64]:
 @pytest.mark.parametrize(
     "image",
     mostly_slow(
-        3,
+        2,
         [
             spots_at([]),
             spots_at([(11, 20), (30, 100), (58, 47), (70, 113), (101, 9), (109, 76)]),
