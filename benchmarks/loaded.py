@@ -4,11 +4,14 @@ Each task runs in a fresh interpreter and a folder of its own, after the command
 processes do not count. `python -m benchmarks.loaded TASK` lists the modules of one task.
 """
 
+import ast
+import io
 import os
 import shutil
 import subprocess
 import sys
 import tempfile
+import tokenize
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -16,28 +19,14 @@ from typing import Any
 
 from benchmarks.measuring import Row, Table
 
-_COUNT = """
-import ast, atexit, io, sys, tokenize
-
-def lines(path):
-    with open(path, encoding="utf-8") as file:
-        text = file.read()
-    ignored = "COMMENT NL NEWLINE INDENT DEDENT ENDMARKER".split()
-    code = set()
-    for token in tokenize.generate_tokens(io.StringIO(text).readline):
-        if tokenize.tok_name[token.type] not in ignored:
-            code.update(range(token.start[0], token.end[0] + 1))
-    for node in ast.walk(ast.parse(text)):
-        for part in node.body if isinstance(getattr(node, "body", None), list) else ():
-            if isinstance(part, ast.Expr) and isinstance(getattr(part.value, "value", None), str):
-                code.difference_update(range(part.lineno, part.end_lineno + 1))
-    return len(code)
+_REPORT = """
+import atexit, sys
 
 def report():
-    loaded = {name: module.__file__ for name, module in list(sys.modules.items())
-              if name.partition(".")[0] == "faintspot" and getattr(module, "__file__", None)}
     with open("loaded.txt", "w") as file:
-        file.writelines(f"{lines(path)} {name}\\n" for name, path in sorted(loaded.items()))
+        for name, module in sorted(sys.modules.items()):
+            if name.partition(".")[0] == "faintspot" and getattr(module, "__file__", None):
+                file.write(f"{name} {module.__file__}\\n")
 
 atexit.register(report)
 """
@@ -106,6 +95,23 @@ def _options(folder: str) -> dict[str, Any]:
 
 
 @cache
+def _lines(path: str) -> int:
+    """Return the lines of code of a module."""
+    text = Path(path).read_text(encoding="utf-8")
+    ignored = ["COMMENT", "NL", "NEWLINE", "INDENT", "DEDENT", "ENDMARKER"]
+    code: set[int] = set()
+    for token in tokenize.generate_tokens(io.StringIO(text).readline):
+        if tokenize.tok_name[token.type] not in ignored:
+            code.update(range(token.start[0], token.end[0] + 1))
+    for node in ast.walk(ast.parse(text)):
+        body = getattr(node, "body", None)
+        for part in body if isinstance(body, list) else ():
+            if isinstance(part, ast.Expr) and isinstance(getattr(part.value, "value", None), str):
+                code.difference_update(range(part.lineno, (part.end_lineno or part.lineno) + 1))
+    return len(code)
+
+
+@cache
 def _made(before: tuple[str, ...]) -> tempfile.TemporaryDirectory[str]:
     """Return a folder with the files that commands make, each of them run once."""
     folder = tempfile.TemporaryDirectory()
@@ -122,13 +128,13 @@ def loaded(task: Task) -> dict[str, int]:
         shutil.copytree(_made(task.before).name, folder, dirs_exist_ok=True)
         beside = subprocess.Popen(_arguments(task.beside), **options) if task.beside else None
         try:
-            subprocess.run(_arguments(task.run, _COUNT), check=True, **options)
+            subprocess.run(_arguments(task.run, _REPORT), check=True, **options)
         finally:
             if beside is not None:
                 beside.kill()
                 beside.wait()
-        lines = (line.split() for line in (Path(folder) / "loaded.txt").read_text().splitlines())
-        return {name: int(count) for count, name in lines}
+        modules = (line.split(maxsplit=1) for line in (Path(folder) / "loaded.txt").read_text().splitlines())
+        return {name: _lines(path) for name, path in modules}
 
 
 def run() -> list[Table]:

@@ -15,7 +15,7 @@ from faintspot.io import SlopeWriter, create_writer, read_slopes
 pytest.importorskip("astropy")
 pytest.importorskip("zarr")
 
-NAMES = ["slopes.zarr", "slopes.npz", "slopes.fits", "slopes.csv"]
+NAMES = ["slopes.npz", "slopes.zarr", "slopes.fits", "slopes.csv"]
 ATTRIBUTES = {
     "fingerprint": "abc",
     "configuration": 'title = "é"\n[sensor]\npixels = 16\n',

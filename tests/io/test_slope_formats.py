@@ -58,14 +58,14 @@ def all_marks(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(slopes_writer, "_MARK_SECONDS", 0.0)
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", mostly_slow(2, NAMES))
 def test_gives_back_what_it_got(tmp_path: Path, name: str) -> None:
     write(tmp_path / name, result(), 8)
     assert_alone(tmp_path / name, result())
 
 
 class TestEveryFormat:
-    @pytest.fixture(params=mostly_slow(2, NAMES))
+    @pytest.fixture(params=mostly_slow(1, NAMES))
     def name(self, request: pytest.FixtureRequest) -> str:
         return str(request.param)
 
