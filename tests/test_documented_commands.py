@@ -80,13 +80,13 @@ def test_toml_is_toml() -> None:
 
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a folder with what pages call their files, of a sensor of 14 x 14 lenslets."""
+    """Return a folder with what pages call their files, of a sensor of 10 x 10 lenslets."""
     from astropy.io import fits
 
     folder = tmp_path_factory.mktemp("recorded")
     rng = np.random.default_rng(1)
     layout = fs.Layout.grid(
-        (14, 14), pixels=16, outer_radius=7, inner_radius=2, origin=(16, 16), frame_shape=(256, 256)
+        (10, 10), pixels=16, outer_radius=5, inner_radius=1.5, origin=(16, 16), frame_shape=(192, 192)
     )
     electrons, _ = sensor_frames(layout, 4, flux_e=3000.0, rng=rng)
     frames = (electrons / 1.9 + rng.normal(100.0, 2.0, electrons.shape)).astype(np.uint16)
