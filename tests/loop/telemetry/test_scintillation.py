@@ -71,6 +71,17 @@ def test_index_speed_and_fades_of_bright_light() -> None:
     np.testing.assert_allclose(found.index, index, atol=5 * found.index_error.max())
 
 
+def test_fades_that_noise_makes_are_taken_off() -> None:
+    """A tenth of them; of the same light without noise the share is known."""
+    rng = np.random.default_rng(0)
+    light = log_normal(rng, 0.1, 20_000, correlation=4.0, is_smooth=True)
+    true = measure_scintillation(light[:, None] * np.ones(10), RATE_HZ).values[SHARE].value
+    flux = measured(rng, light, 60.0, 10)
+    made = np.mean(flux.sum(axis=1) < 0.5 * flux.sum(axis=1).mean()) - true
+    assert made > 0.1 * true
+    assert abs(measure_scintillation(flux, RATE_HZ).values[SHARE].value - true) < 0.5 * made
+
+
 def test_light_that_is_steady_is_not_seen_to_vary() -> None:
     """Faint light, too, whose noise varies 30 times as much as the limit that is stated."""
     for flux_e, seed in ((5.0, 2), (500.0, 3)):
