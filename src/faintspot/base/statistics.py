@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -25,6 +26,11 @@ FWHM_TO_STD = 1.0 / (2.0 * math.sqrt(2.0 * math.log(2.0)))
 _LEVEL = 0.95
 _NORMAL = 1.959964
 _WIDENING = 1.96  # standard errors on each side of an interval
+
+
+def mad_std(values: NDArray[Any]) -> float:
+    """Return the standard deviation of normal values, from their median absolute deviation."""
+    return MAD_TO_STD * float(np.median(np.abs(values - np.median(values))))
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.arrays import Floats
-from faintspot.base.statistics import MAD_TO_STD
+from faintspot.base.statistics import MAD_TO_STD, mad_std
 from faintspot.base.tables import is_map
 from faintspot.slopes.camera.calibration import Calibration
 from faintspot.slopes.camera.frame_checks import find_hot_pixels
@@ -79,9 +79,8 @@ def shrunk_variance(variance: Floats, degrees: int) -> tuple[Floats, float]:
     if positive.size == 0:
         return variance, 0.0
     logarithm = np.log(positive)
-    middle = np.median(logarithm)
-    spread = MAD_TO_STD * np.median(np.abs(logarithm - middle))
-    logarithm = logarithm[np.abs(logarithm - middle) <= _OUTLYING * spread]
+    away = np.abs(logarithm - np.median(logarithm))
+    logarithm = logarithm[away <= _OUTLYING * mad_std(logarithm)]
     half_degrees = 0.5 * degrees
     centre = float(logarithm.mean()) - float(digamma(half_degrees)) + math.log(half_degrees)
     excess = float(logarithm.var()) - float(polygamma(1, half_degrees))

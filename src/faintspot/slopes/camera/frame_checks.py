@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from faintspot.base.checks import real_array
 from faintspot.base.errors import InputError
-from faintspot.base.statistics import MAD_TO_STD
+from faintspot.base.statistics import mad_std
 
 # Standard deviation of spots below which a pixel differs from its neighbours without a filter, too: those of
 # 0.9 px have a contrast of 1.16 where all lie at the same place of their pixel.
@@ -225,7 +225,7 @@ def find_hot_pixels(frame: ArrayLike) -> NDArray[np.int64]:
     ring = np.ones((3, 3), bool)
     ring[1, 1] = False
     excess = image - median_filter(image, footprint=ring, mode="mirror")
-    noise = MAD_TO_STD * np.median(np.abs(excess - np.median(excess)))
+    noise = mad_std(excess)
     second_largest = rank_filter(image, -2, footprint=ring, mode="mirror")
     spread = second_largest - minimum_filter(image, footprint=ring, mode="mirror")
     return np.argwhere((excess > _HOT * noise) & (excess > _SHARPNESS * spread) & ~not_finite)

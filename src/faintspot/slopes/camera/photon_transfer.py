@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from faintspot.base.arrays import Floats
 from faintspot.base.checks import finite_array, number_between
 from faintspot.base.errors import InputError
-from faintspot.base.statistics import MAD_TO_STD, UNKNOWN, Estimate
+from faintspot.base.statistics import UNKNOWN, Estimate, mad_std
 from faintspot.slopes.camera.dark_frames import DarkPixels, dark_pixels
 from faintspot.slopes.camera.frame_checks import are_repeated
 from faintspot.slopes.camera.transfer_curve import LineFit, TransferCurve, fit_line, photon_transfer
@@ -176,7 +176,7 @@ def _measure_dark(darks: Floats) -> tuple[_Dark, Estimate]:
     read_noise = math.sqrt(float(np.median(variance)) * degrees / float(scipy.special.chdtri(degrees, 0.5)))
     # Variance of the median of many variances: 1.25 times that of their mean.
     relative = 1.25 * math.sqrt(2 / (degrees * level.size))
-    spread = 1.25 * MAD_TO_STD * float(np.median(np.abs(level - np.median(level)))) / math.sqrt(level.size)
+    spread = 1.25 * mad_std(level) / math.sqrt(level.size)
     typical = Estimate(float(np.median(level)), spread)
     pixels = dark_pixels(level, residuals)
     return _Dark(level, typical, pixels), Estimate(read_noise, 0.5 * relative * read_noise)

@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from faintspot.base.checks import image_stack, numbers_between, one_of
 from faintspot.base.errors import InputError
-from faintspot.base.statistics import FWHM_TO_STD, MAD_TO_STD
+from faintspot.base.statistics import FWHM_TO_STD, mad_std
 from faintspot.slopes.kernels.host import lanes_for
 from faintspot.slopes.kernels.parallel import run_groups
 from faintspot.slopes.kernels.positions.gravity import centroid_stack, subtract_stack
@@ -260,7 +260,7 @@ def like_most(images: ArrayLike) -> NDArray[np.bool_]:
             correlation[lag - 1] += np.einsum("fnyx,fnyx->n", along[..., :-lag], along[..., lag:])
     power = correlation[0]
     typical = max(float(np.median(power)), 0.0)
-    scatter = MAD_TO_STD * float(np.median(np.abs(power - np.median(power))))
+    scatter = mad_std(power)
     kept = power <= _MOST_SQUARED_FLUX * typical + _OUTLYING * scatter
     if typical > scatter:
         below = correlation < 0.5 * power

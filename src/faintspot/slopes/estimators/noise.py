@@ -1,5 +1,6 @@
 """Noise of the pixels, and the denoising strength suggested by it."""
 
+import math
 from typing import Any, Literal, NamedTuple, TypedDict, Unpack, overload
 
 import numpy as np
@@ -7,7 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from faintspot.base.checks import image_stack, number_between, numbers_between, one_of
 from faintspot.base.errors import InputError
-from faintspot.base.statistics import MAD_TO_STD
+from faintspot.base.statistics import mad_std
 from faintspot.base.tables import PRESETS, of_denoising
 from faintspot.slopes.kernels.host import lanes_for
 from faintspot.slopes.kernels.parallel import run_groups
@@ -81,7 +82,7 @@ def pixel_noise(images: ArrayLike) -> float:
     differences = np.diff(edges, axis=0 if several_frames else -1)
     if several_frames and differences.any():  # frames that a grabber wrote twice show no noise
         differences = differences[differences.any(axis=(1, 2, 3))]
-    return float(MAD_TO_STD * np.median(np.abs(differences - np.median(differences))) / np.sqrt(2.0))
+    return mad_std(differences) / math.sqrt(2.0)
 
 
 ALGORITHMS = {"fgp": FGP, "chambolle": CHAMBOLLE}

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from faintspot.base.checks import LARGEST_FLOAT32, real_array
 from faintspot.base.errors import InputError
 from faintspot.base.flags import UNMEASURED, SubapertureFlag, scaled_positions
-from faintspot.base.statistics import FWHM_TO_STD, MAD_TO_STD
+from faintspot.base.statistics import FWHM_TO_STD, mad_std
 from faintspot.slopes.camera.calibration import Calibration, binned
 from faintspot.slopes.estimators.base import Estimator
 from faintspot.slopes.kernels.validity.doubtful import doubtful_scratch_size, flag_doubtful
@@ -198,11 +198,10 @@ class SpotFollower:
         bright = float(np.median(images.max(axis=(1, 2))))  # hot pixels count no more than a spot
         mean = np.minimum(images, bright).mean(axis=0)
         smooth = scipy.ndimage.gaussian_filter(mean, self._width_px or 1.0, mode="nearest")
-        level = np.median(smooth)
-        noise = MAD_TO_STD * np.median(np.abs(smooth - level))
+        limit = np.median(smooth) + _CERTAIN * mad_std(smooth)
         y, x = np.unravel_index(np.argmax(smooth), smooth.shape)
         motion = complex(float(x) - self._half[0], float(y) - self._half[1])
-        return motion if smooth[y, x] > level + _CERTAIN * noise and abs(motion) > _SMALL_PX else 0.0
+        return motion if smooth[y, x] > limit and abs(motion) > _SMALL_PX else 0.0
 
     def _acquired(
         self, calibrated: NDArray[np.float32], expected: Complex, *, bent: bool = True

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from faintspot.base.arrays import Floats
 from faintspot.base.errors import InputError, errors_within
-from faintspot.base.statistics import FWHM_TO_STD, MAD_TO_STD
+from faintspot.base.statistics import FWHM_TO_STD, mad_std
 from faintspot.base.tables import Tables
 from faintspot.io.frames import FrameSource, open_frames
 from faintspot.slopes.camera.calibration import Calibration, binned, read_map
@@ -322,7 +322,7 @@ def _roughness(image: Floats) -> float:
     """Return the standard deviation of structures as large as spots, between these."""
     filled = np.where(np.isfinite(image), image, np.nanmedian(image))
     band = scipy.ndimage.gaussian_filter(filled, 1.0) - scipy.ndimage.gaussian_filter(filled, 4.0)
-    return MAD_TO_STD * float(np.median(np.abs(band - np.median(band))))
+    return mad_std(band)
 
 
 def is_quad_cell(layout: Layout) -> bool:

@@ -27,7 +27,7 @@ from faintspot.base.report.plots import (
     plot,
     png,
 )
-from faintspot.base.statistics import MAD_TO_STD
+from faintspot.base.statistics import mad_std
 from faintspot.slopes.sensor.layout import Layout
 from faintspot.slopes.sensor.pupil import lenslet_outlines, lenslet_pitch
 
@@ -226,7 +226,7 @@ def asinh_stretch(array: Floats, inside: Floats) -> FuncNorm:
 
     good = array[np.isfinite(array)]
     sky = float(np.median(good)) if good.size else 0.0
-    noise = MAD_TO_STD * float(np.median(np.abs(good - sky))) if good.size else 0.0
+    noise = mad_std(good) if good.size else 0.0
     low, high = limits_of(inside, percent=99.5)
     low, high = min(low, sky - 2 * noise), max(high, sky + 5 * noise)
     if not high > low:

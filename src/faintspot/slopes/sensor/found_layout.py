@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from faintspot.base.checks import number_between
 from faintspot.base.errors import InputError
-from faintspot.base.statistics import MAD_TO_STD
+from faintspot.base.statistics import mad_std
 from faintspot.slopes.kernels.host import lanes_for
 from faintspot.slopes.kernels.validity.doubtful import Expected, doubtful_scratch_size, flag_doubtful
 from faintspot.slopes.sensor.binning import magnified_layout, scaled_points
@@ -339,6 +339,6 @@ def _dark_level(flux: NDArray[np.float64]) -> float:
     between = (ordered.sum() * number / len(flux) - lower) ** 2 / (number * (len(flux) - number))
     split = int(np.argmax(between)) + 1
     level = float(np.median(ordered[:split]))
-    scatter = MAD_TO_STD * float(np.median(np.abs(ordered[:split] - level)))
     apart = float(np.median(ordered[split:])) - level
-    return level if min(split, len(flux) - split) >= 4 and apart > _APART * scatter else np.nan
+    is_apart = apart > _APART * mad_std(ordered[:split])
+    return level if min(split, len(flux) - split) >= 4 and is_apart else np.nan

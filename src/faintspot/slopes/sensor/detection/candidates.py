@@ -21,7 +21,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from faintspot.base.statistics import MAD_TO_STD
+from faintspot.base.statistics import mad_std
 from faintspot.slopes.sensor.region import neighbours_of
 
 RATIOS = {"square": 1j, "hexagonal": complex(np.exp(1j * np.pi / 3))}
@@ -118,7 +118,7 @@ class Lattice:
 
 def robust_std(values: NDArray[Any]) -> float:
     """Return the standard deviation from the median absolute deviation; the ordinary one if that is 0."""
-    deviation = MAD_TO_STD * float(np.median(np.abs(values - np.median(values))))
+    deviation = mad_std(values)
     return deviation if deviation > 1e-9 * float(np.ptp(values)) else float(values.std())
 
 

@@ -13,7 +13,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from faintspot.base.statistics import MAD_TO_STD
+from faintspot.base.statistics import MAD_TO_STD, mad_std
 from faintspot.slopes.sensor.detection.candidates import Lattice
 from faintspot.slopes.sensor.detection.nodes import SEARCH, NodeFlux, SpotFlux
 from faintspot.slopes.sensor.region import links_of
@@ -245,7 +245,7 @@ def _spans(cells: NDArray[np.int64]) -> bool:
 def _log_scatter(flux: NDArray[np.float64]) -> float:
     """Return the robust standard deviation of the logarithm of the flux, limited to plausible values."""
     logs = np.log(np.maximum(flux, 1e-300))
-    return float(np.clip(MAD_TO_STD * np.median(np.abs(logs - np.median(logs))), *_SCATTER))
+    return float(np.clip(mad_std(logs), *_SCATTER))
 
 
 def _least_cost(evidence: NDArray[np.float64], links: NDArray[np.int64], cost: float) -> NDArray[np.bool_]:
