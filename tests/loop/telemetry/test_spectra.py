@@ -51,6 +51,17 @@ def test_too_few_slopes() -> None:
         assert "too few" in each.remark
 
 
+@pytest.mark.slow
+def test_noise_hides_both() -> None:
+    loop = recorded().part(slice(0, 500))
+    noise = np.random.default_rng(1).normal(0.0, 1.0, loop.slopes.shape)
+    seen = open_loop_of(replace(loop, slopes=noise, commands=None), LoopDelay(2.0, 0.0, 1.0, 0.0))
+    identified = Identification(seen.telemetry, loop.site, loop.frame_rate_hz)
+    for each in recorded_discrepancy(loop, seen, identified.of_winds(np.zeros((1, 2)))):
+        assert not np.isfinite(each.value)
+        assert each.remark
+
+
 def test_a_spectrum_is_variance_by_frequency() -> None:
     """White noise of 0.2 px in four sub-apertures: modes have its variance up to half the rate."""
     loop = recorded().part(slice(0, 1500))

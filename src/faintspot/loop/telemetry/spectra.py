@@ -109,6 +109,8 @@ _LEAST_MEASURED = 0.7  # of the frames, of slopes that are compared
 _BLOCKS = 12
 _COMMON_ERRORS = 0.005, 0.02
 """Standard errors, rad and relative, of partly illuminated sub-apertures."""
+_LARGEST_ERROR = 0.5
+"""The changes are taken to be small."""
 
 
 def recorded_discrepancy(loop: Recording, open_loop: OpenLoop, identified: Identified) -> list[Measured]:
@@ -140,6 +142,8 @@ def recorded_discrepancy(loop: Recording, open_loop: OpenLoop, identified: Ident
         (value, math.hypot(error, common))
         for (value, error), common in zip(shares, _COMMON_ERRORS, strict=True)
     )
+    if max(angle_error, gain_error) > _LARGEST_ERROR:
+        return [Measured(*quantity, remark="hidden by noise") for quantity in changes]
     turned, stretched = changes
     about = "of the detector's axes from those of the lenslets"
     return [
