@@ -63,6 +63,8 @@ def night(path: Path) -> Telemetry:
 
 def test_methods_in_turn_differ_as_they_were_made(night: Telemetry) -> None:
     values = quantities(night)
+    for known in values.values():
+        known[::7] = np.nan
     rms, flux = (
         compared_methods(night.method, ("none", "tv"), values[name])
         for name in ("rms of slopes about their mean (px)", "flux (e-)")
