@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from faintspot.base import __version__ as __version__
-from faintspot.base.errors import lazy_attributes
+from faintspot.base.errors import lazy_names
 
 if TYPE_CHECKING:
     from faintspot import adapters as adapters
@@ -46,46 +46,6 @@ if TYPE_CHECKING:
     from faintspot.slopes.wavefront import Wavefront as Wavefront
     from faintspot.slopes.wavefront import fit_wavefront as fit_wavefront
 
-_PACKAGES = ("adapters", "data", "engine", "experiments", "io", "loop", "slopes", "testing")
-# Where each public name lives. They are imported at first use: `import faintspot` itself stays fast.
-_HOMES = {
-    "Calibration": "faintspot.slopes.camera.calibration",
-    "Denoised": "faintspot.slopes.estimators.noise",
-    "FixedWeights": "faintspot.slopes.spots.fixed_weights",
-    "InputError": "faintspot.base.errors",
-    "LaserGuideStar": "faintspot.slopes.spots.laser",
-    "Layout": "faintspot.slopes.sensor.layout",
-    "MeanFlux": "faintspot.slopes.pipeline.light",
-    "MissingExtraError": "faintspot.base.errors",
-    "PSF": "faintspot.slopes.spots.psf",
-    "Settings": "faintspot.slopes.pipeline.settings",
-    "SlopePipeline": "faintspot.slopes.pipeline.slope_pipeline",
-    "Slopes": "faintspot.slopes.pipeline.slopes",
-    "SodiumProfile": "faintspot.slopes.spots.sodium",
-    "SpotFollower": "faintspot.slopes.pipeline.following",
-    "Stages": "faintspot.slopes.pipeline.slopes",
-    "SubapertureFlag": "faintspot.base.flags",
-    "Wavefront": "faintspot.slopes.wavefront",
-    "brightest_pixels": "faintspot.slopes.estimators.centroid",
-    "centre_of_gravity": "faintspot.slopes.estimators.centroid",
-    "control": "faintspot.loop",
-    "cramer_rao": "faintspot.slopes.spots.bounds",
-    "cramer_rao_covariance": "faintspot.slopes.spots.bounds",
-    "fit_wavefront": "faintspot.slopes.wavefront",
-    "learn_psf": "faintspot.slopes.training",
-    "measure_images": "faintspot.slopes.pipeline.following",
-    "measure_detector": "faintspot.slopes.camera.photon_transfer",
-    "photon_efficiency": "faintspot.slopes.spots.bounds",
-    "tune": "faintspot.experiments",
-    "tv_denoise": "faintspot.slopes.estimators.noise",
-    **{name: f"faintspot.{name}" for name in _PACKAGES},
-}
-
-__all__ = [*sorted(_HOMES), "__version__"]
-
-
-__getattr__ = lazy_attributes(__name__, _HOMES)
-
-
-def __dir__() -> list[str]:
-    return __all__
+# Imported at first use: `import faintspot` itself stays fast.
+__getattr__, __dir__, __all__ = lazy_names(__name__)
+__all__ += ["__version__"]

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import os
+import re
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 from pkgutil import iter_modules
 from typing import Any
+
+_FOR_TYPE_CHECKERS = re.compile(r"^    from (\S+) import \(?\s*(\w+) as \2\b", re.MULTILINE)
 
 
 class InputError(ValueError):
@@ -148,32 +151,26 @@ def require_linux(purpose: str) -> None:
         raise InputError(f"{purpose} needs shared memory in {SHARED_MEMORY}, which Linux has")
 
 
-def lazy_attributes(package: str, homes: Mapping[str, str]) -> Callable[[str], object]:
-    """Return the `__getattr__` of a package.
+def lazy_names(package: str) -> tuple[Callable[[str], object], Callable[[], list[str]], list[str]]:
+    """Return `__getattr__`, `__dir__` and `__all__` of a package whose public names load on first use.
 
-    Parameters
-    ----------
-    package : str
-        Name of the package.
-    homes : mapping of str
-        Module that defines each public name; a name may also be a module of the package.
+    The names are those that its source imports for type checkers, under `if TYPE_CHECKING`, each in a line
+    of its own and as itself: modules of the package, and names from any module.
     """
+    source = Path(str(sys.modules[package].__file__)).read_text(encoding="utf-8")
+    homes = {name: home for home, name in _FOR_TYPE_CHECKERS.findall(source)}
+    names = sorted(homes)
 
     def get(name: str) -> Any:
         """Import a public name on first use."""
         if name not in homes:
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
-        home = import_module(homes[name])
-        value = home if home.__name__ == f"{package}.{name}" else getattr(home, name)
+        is_module = homes[name] == package
+        value = import_module(f"{package}.{name}") if is_module else getattr(import_module(homes[name]), name)
         setattr(sys.modules[package], name, value)
         return value
 
-    return get
-
-
-def lazy_packages(package: str, names: str) -> Callable[[str], object]:
-    """Return the `__getattr__` of a package whose sub-packages (names separated by spaces) load lazily."""
-    return lazy_attributes(package, {name: f"{package}.{name}" for name in names.split()})
+    return get, lambda: names, names
 
 
 def import_modules(package: str) -> list[str]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from faintspot.base.errors import lazy_attributes
+from faintspot.base.errors import lazy_names
 
 if TYPE_CHECKING:
     from faintspot.experiments.closed_loop.magnitude import run_magnitude as run_magnitude
@@ -23,27 +23,4 @@ if TYPE_CHECKING:
     from faintspot.experiments.study.sweep import Cell as Cell
     from faintspot.experiments.study.sweep import Sweep as Sweep
 
-_NAMES = {
-    "planner.answer": "Answer",
-    "planner.text": "tune_figure",
-    "study.cell": "measure_cell",
-    "closed_loop.magnitude": "run_magnitude",
-    "planner.promise": "Promise check_promises",
-    "planner.question": "Question",
-    "planner.recorded": "question_from_frames",
-    "running": "WorkerPool",
-    "study.specification": "StudySpecification",
-    "study.run": "open_study run",
-    "study.sweep": "Cell Sweep",
-    "planner.tuning": "tune",
-}
-_HOMES = {name: f"{__name__}.{module}" for module, names in _NAMES.items() for name in names.split()}
-
-__all__ = sorted(_HOMES)
-
-
-__getattr__ = lazy_attributes(__name__, _HOMES)
-
-
-def __dir__() -> list[str]:
-    return __all__
+__getattr__, __dir__, __all__ = lazy_names(__name__)

@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING
 
-from faintspot.base.errors import lazy_attributes
+from faintspot.base.errors import lazy_names
 
 if TYPE_CHECKING:
     from faintspot.io.aot_reading import AotSensor as AotSensor
@@ -18,21 +18,4 @@ if TYPE_CHECKING:
     from faintspot.io.telemetry import Telemetry as Telemetry
     from faintspot.io.telemetry import read_telemetry as read_telemetry
 
-_HOMES = {
-    "AotSensor": "faintspot.io.aot_reading",
-    "FrameSource": "faintspot.io.frames",
-    "SlopeWriter": "faintspot.io.slopes_writer",
-    "StoredSlopes": "faintspot.io.file_format",
-    "Telemetry": "faintspot.io.telemetry",
-    "create_writer": "faintspot.io.slopes",
-    "open_frames": "faintspot.io.frames",
-    "read_aot": "faintspot.io.aot_reading",
-    "read_array": "faintspot.io.frames",
-    "read_slopes": "faintspot.io.slopes",
-    "read_telemetry": "faintspot.io.telemetry",
-    "write_aot": "faintspot.io.aot_writing",
-}
-
-__all__ = [*sorted(_HOMES)]
-
-__getattr__ = lazy_attributes(__name__, _HOMES)
+__getattr__, __dir__, __all__ = lazy_names(__name__)

@@ -7,11 +7,11 @@ of recorded loops).
 
 from typing import TYPE_CHECKING
 
-from faintspot.base.errors import lazy_packages
+from faintspot.base.errors import lazy_names
 
 if TYPE_CHECKING:
     from faintspot.loop import control as control
     from faintspot.loop import simulation as simulation
     from faintspot.loop import telemetry as telemetry
 
-__getattr__ = lazy_packages(__name__, "control simulation telemetry")
+__getattr__, __dir__, __all__ = lazy_names(__name__)

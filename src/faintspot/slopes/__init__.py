@@ -8,7 +8,7 @@
 
 from typing import TYPE_CHECKING
 
-from faintspot.base.errors import lazy_packages
+from faintspot.base.errors import lazy_names
 
 if TYPE_CHECKING:
     from faintspot.slopes import camera as camera
@@ -22,6 +22,4 @@ if TYPE_CHECKING:
     from faintspot.slopes import training as training
     from faintspot.slopes import wavefront as wavefront
 
-__getattr__ = lazy_packages(
-    __name__, "camera estimators kernels pipeline recorded sensor simulate spots training wavefront"
-)
+__getattr__, __dir__, __all__ = lazy_names(__name__)

@@ -11,7 +11,7 @@ For the loops of other systems: `Recording`, learning and `PredictiveControl`.
 
 from typing import TYPE_CHECKING
 
-from faintspot.base.errors import lazy_attributes
+from faintspot.base.errors import lazy_names
 
 if TYPE_CHECKING:
     from faintspot.loop.control.identification.predictive_control import (
@@ -20,14 +20,4 @@ if TYPE_CHECKING:
     from faintspot.loop.control.identification.predictive_control import learn as learn
     from faintspot.loop.control.identification.recording import Recording as Recording
 
-_PACKAGE = "faintspot.loop.control.identification"
-_HOMES = {
-    "PredictiveControl": f"{_PACKAGE}.predictive_control",
-    "Recording": f"{_PACKAGE}.recording",
-    "learn": f"{_PACKAGE}.predictive_control",
-}
-
-__all__ = sorted(_HOMES)
-
-
-__getattr__ = lazy_attributes(__name__, _HOMES)
+__getattr__, __dir__, __all__ = lazy_names(__name__)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from faintspot.base.errors import lazy_attributes
+from faintspot.base.errors import lazy_names
 
 if TYPE_CHECKING:
     from faintspot.loop.simulation.configuration import LoopConfiguration as LoopConfiguration
@@ -14,16 +14,4 @@ if TYPE_CHECKING:
     from faintspot.loop.simulation.record import LoopRecord as LoopRecord
     from faintspot.loop.simulation.simulation import simulate_loop as simulate_loop
 
-_HOMES = {
-    "Method": "faintspot.loop.simulation.methods",
-    "LoopConfiguration": "faintspot.loop.simulation.configuration",
-    "LoopRecord": "faintspot.loop.simulation.record",
-    "load_loop": "faintspot.loop.simulation.configuration",
-    "shipped_loops": "faintspot.loop.simulation.configuration",
-    "simulate_loop": "faintspot.loop.simulation.simulation",
-}
-
-__all__ = sorted(_HOMES)
-
-
-__getattr__ = lazy_attributes(__name__, _HOMES)
+__getattr__, __dir__, __all__ = lazy_names(__name__)

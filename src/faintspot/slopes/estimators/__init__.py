@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from faintspot.base.errors import lazy_attributes
+from faintspot.base.errors import lazy_names
 
 if TYPE_CHECKING:
     from faintspot.base.options import option as option
@@ -22,19 +22,4 @@ if TYPE_CHECKING:
     from faintspot.slopes.estimators.sensor import Scene as Scene
     from faintspot.slopes.estimators.sensor import Sensor as Sensor
 
-_HOMES = {
-    "Estimator": "faintspot.slopes.estimators.base",
-    "Need": "faintspot.slopes.estimators.base",
-    "Positions": "faintspot.slopes.estimators.base",
-    "Scene": "faintspot.slopes.estimators.sensor",
-    "Sensor": "faintspot.slopes.estimators.sensor",
-    "Style": "faintspot.slopes.estimators.base",
-    "estimator_named": "faintspot.slopes.estimators.registry",
-    "estimators": "faintspot.slopes.estimators.registry",
-    "option": "faintspot.base.options",
-    "register": "faintspot.slopes.estimators.registry",
-}
-
-__all__ = [*sorted(_HOMES)]
-
-__getattr__ = lazy_attributes(__name__, _HOMES)
+__getattr__, __dir__, __all__ = lazy_names(__name__)

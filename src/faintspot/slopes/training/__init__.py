@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING
 
-from faintspot.base.errors import lazy_attributes
+from faintspot.base.errors import lazy_names
 
 if TYPE_CHECKING:
     from faintspot.slopes.training.centroid_gain import CentroidGain as CentroidGain
@@ -15,18 +15,4 @@ if TYPE_CHECKING:
     from faintspot.slopes.training.sodium import fit_sodium_profile as fit_sodium_profile
     from faintspot.slopes.training.sodium import fit_spot as fit_spot
 
-_HOMES = {
-    "CentroidGain": "faintspot.slopes.training.centroid_gain",
-    "LearntPSF": "faintspot.slopes.training.psf_learning",
-    "MeanImages": "faintspot.slopes.training.sodium",
-    "SodiumFit": "faintspot.slopes.training.sodium",
-    "fit_sodium_profile": "faintspot.slopes.training.sodium",
-    "fit_spot": "faintspot.slopes.training.sodium",
-    "learn_psf": "faintspot.slopes.training.psf_learning",
-    "learn_psf_from_images": "faintspot.slopes.training.psf_learning",
-    "measure_centroid_gain": "faintspot.slopes.training.centroid_gain",
-}
-
-__all__ = sorted(_HOMES)
-
-__getattr__ = lazy_attributes(__name__, _HOMES)
+__getattr__, __dir__, __all__ = lazy_names(__name__)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from faintspot.base.errors import lazy_attributes
+from faintspot.base.errors import lazy_names
 
 if TYPE_CHECKING:
     from faintspot.slopes.wavefront.certificate import Certificate as Certificate
@@ -18,20 +18,4 @@ if TYPE_CHECKING:
     from faintspot.slopes.wavefront.fit import fit_wavefront as fit_wavefront
     from faintspot.slopes.wavefront.zernike import zernike as zernike
 
-_HOMES = {
-    "Certificate": "faintspot.slopes.wavefront.certificate",
-    "Discrepancy": "faintspot.slopes.wavefront.discrepancy",
-    "Wavefront": "faintspot.slopes.wavefront.fit",
-    "certify": "faintspot.slopes.wavefront.certificate",
-    "Drift": "faintspot.slopes.wavefront.certificate",
-    "fit_drift": "faintspot.slopes.wavefront.certificate",
-    "fit_wavefront": "faintspot.slopes.wavefront.fit",
-    "save_wavefront": "faintspot.slopes.wavefront.files",
-    "slope_discrepancy": "faintspot.slopes.wavefront.discrepancy",
-    "zernike": "faintspot.slopes.wavefront.zernike",
-}
-
-__all__ = sorted(_HOMES)
-
-
-__getattr__ = lazy_attributes(__name__, _HOMES)
+__getattr__, __dir__, __all__ = lazy_names(__name__)
