@@ -6,6 +6,7 @@ import subprocess
 import sys
 import threading
 from pathlib import Path
+from typing import Any
 from uuid import uuid4
 
 import numpy as np
@@ -20,6 +21,7 @@ from faintspot.cli.realtime import control as realtime_control
 from faintspot.engine.engine import Engine
 from faintspot.engine.frames.readout import Replay
 from faintspot.engine.frames.workers import PipelineMaker
+from faintspot.engine.processes.segment import FOLDER
 from faintspot.engine.request_handlers import commands_of
 from faintspot.engine.streams.bridge import StreamBridge
 from faintspot.io import open_frames
@@ -31,8 +33,10 @@ pytestmark = pytest.mark.slow
 
 
 def test_what_is_published(bench: Bench) -> None:
-    """Slopes, details and marks, stamped with the frame's number."""
+    """Slopes, details and marks, stamped with the frame's number; nobody else publishes under this name."""
     data = simulated(1)
+    with refused(bench.name):
+        Engine(bench.name, make, SETTINGS)
     expected = make(SETTINGS)(data[0])
     streams = {name: pyshmem.open(f"{bench.name}_{name}") for name in ("slopes", "details", "marks")}
     bench.measure(data, [17])
@@ -46,17 +50,6 @@ def test_what_is_published(bench: Bench) -> None:
     assert 0 < published_ns - last_row_ns < 60e9
     for stream in streams.values():
         stream.close()
-
-
-def test_restarted_source_loses_no_frame(bench: Bench) -> None:
-    data = simulated(2)
-    expected = make(SETTINGS)(data).vector
-    for start in (0, 100):
-        bench.measure(data, [start, start + 1])
-        bench.detached()
-    for start in (0, 100):
-        assert np.array_equal(bench.slopes[start + 1], expected[1])
-    assert bench.engine.counters.source_restarts == 2
 
 
 NOTHING_IS_COMPILED_LATER = """
@@ -106,11 +99,6 @@ def test_frames_of_a_ring_that_was_waited_for_count(bench: Bench, monkeypatch: p
     counters = bench.engine.counters
     assert (counters.processed + counters.dropped, counters.skipped) == (10, 0)
     assert 9 in bench.slopes
-
-
-def test_a_living_publisher_is_not_replaced(bench: Bench) -> None:
-    with refused(bench.name):
-        Engine(bench.name, make, SETTINGS)
 
 
 def test_frames_of_a_stream() -> None:
@@ -171,7 +159,7 @@ def test_the_terminal_shows_the_status(bench: Bench, monkeypatch: pytest.MonkeyP
     assert f"process {os.getpid()}, frame 0" in text
 
 
-def test_new_spots_are_measured_with_from_the_next_frame(tmp_path: Path) -> None:
+def test_new_spots_are_measured_with_from_the_next_frame(bench: Bench, tmp_path: Path) -> None:
     """Slopes are those of a pipeline that has known them from the start."""
     layout, calibration = fs.Layout.grid((3, 3), pixels=10), fs.Calibration(100.0, read_noise_e=1.0)
     settings = fs.Settings("ml", flux_e=300.0)
@@ -192,8 +180,108 @@ def test_new_spots_are_measured_with_from_the_next_frame(tmp_path: Path) -> None
     np.testing.assert_array_equal(engine.live.newest.pipelines[0](frame).vector, expected(frame).vector)
     engine._streams.close()
     engine._telemetry.close()
+    with refused("pipelines"):  # that are not made from files
+        commands_of(bench.engine)["spots"]({"spots": str(path)})
 
 
-def test_an_engine_of_other_pipelines_refuses_new_spots(bench: Bench, tmp_path: Path) -> None:
-    with pytest.raises(fs.InputError, match="pipelines"):
-        commands_of(bench.engine)["spots"]({"spots": str(tmp_path / "faintspot.toml")})
+def test_a_source_that_goes_and_comes_back(bench: Bench) -> None:
+    """It ends, it has another size, its file is removed: every frame is measured, once."""
+    data = simulated(4)
+    expected = make(SETTINGS)(data).vector
+    bench.measure(data[:2], [0, 1])
+    bench.detached()
+    with bench.ring(shape=(64, 64)) as ring:
+        bench.until(lambda: bench.engine.status()["source_refused"] is not None)
+        ring.publish(np.zeros((64, 64), np.uint16))
+        assert "64 x 64 pixels, uint16; expected 32 x 32" in bench.engine.status()["source_refused"]
+    first = bench.ring()
+    bench.attached()
+    assert bench.engine.status()["source_refused"] is None
+    bench.send(first, 2, data[2])
+    (FOLDER / bench.name).unlink()
+    bench.detached()
+    bench.measure(data[3:], [3])
+    bench.detached()
+    first.close()
+    assert bench.records["frame"].tolist() == [0, 1, 2, 3]
+    np.testing.assert_array_equal([bench.slopes[number] for number in range(4)], expected)
+    assert bench.engine.counters.source_restarts == 3
+
+
+def test_overtaken_frames_are_dropped_never_mixed(bench: Bench) -> None:
+    """A camera that does not wait: what is published belongs to one frame, the rest is counted."""
+    data, n_frames = simulated(8), 2000
+    expected = make(SETTINGS)(data).vector
+    counters = bench.engine.counters
+    with bench.ring() as ring:
+        bench.attached()
+        for number in range(n_frames):
+            ring.publish(data[number % 8], number)
+            if number % 100 == 0:
+                bench.until(lambda number=number: counters.frames_in > number)
+        bench.until(lambda: counters.processed + counters.dropped >= n_frames - 1)
+    assert counters.dropped > 0
+    lost = counters.torn + counters.passed_over
+    assert counters.dropped == lost == sum(bench.engine.account.lost_because.values())
+    records = bench.records
+    assert counters.frames_in - counters.dropped == counters.processed == len(records)
+    assert (np.diff(records["frame"]) > 0).all()
+    for record in records:
+        vector = np.concatenate([record["x"], record["y"]])
+        assert np.array_equal(vector, expected[record["frame"] % 8])
+
+
+def test_a_worker_dies(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One frame is dropped and counted; the thread is replaced and the loop goes on."""
+    data = simulated(4)
+    with Bench(threads=2) as bench:
+        with bench.ring() as ring:
+            bench.attached()
+            bench.send(ring, 0, data[0])
+            path = bench.engine._path
+            work: Any = path._work  # type: ignore[union-attr]
+            alive = [True]
+
+            def deadly(share: int, *arguments: Any) -> bool:
+                if share == 1 and alive:
+                    alive.clear()
+                    raise MemoryError
+                return bool(work(share, *arguments))
+
+            monkeypatch.setattr(path, "_work", deadly)
+            for number in (1, 2, 3):
+                bench.send(ring, number, data[number])
+        counters = bench.engine.counters
+        assert (counters.worker_restarts, counters.dropped) == (1, 1)
+        assert np.array_equal(bench.slopes[3], make(SETTINGS)(data[3]).vector)
+
+
+def test_settings_of_each_subaperture_change_while_frames_come(bench: Bench) -> None:
+    """No frame is lost or mixed: each is that of the settings that its record names, bit for bit."""
+    data, ended = simulated(8), threading.Event()
+    proposed: list[dict[str, Any]] = [{}]
+
+    def propose() -> None:
+        rng = np.random.default_rng(2)
+        while not ended.is_set():
+            strength, limit = rng.uniform(0.5, 2.5, 16), rng.integers(1, 30, 16)
+            values = {"noise_std": strength, "max_iterations": limit, "tolerance": rng.uniform(0, 0.01)}
+            proposed.append(values)
+            bench.engine.live.propose(values)
+
+    proposer = threading.Thread(target=propose)
+    with bench.ring() as ring:
+        bench.attached()
+        proposer.start()
+        for number in range(150):
+            bench.send(ring, number, data[number % 8])
+        ended.set()
+        proposer.join()
+    records = bench.records
+    assert records["frame"].tolist() == list(range(150))
+    assert (np.diff(records["change"]) >= 0).all()
+    assert len(np.unique(records["change"])) > 3  # some were overtaken by the next
+    for record in records:
+        settings = SETTINGS.replace(**proposed[record["change"]])
+        expected = make(settings)(data[record["frame"] % 8]).vector
+        np.testing.assert_array_equal(np.concatenate([record["x"], record["y"]]), expected)

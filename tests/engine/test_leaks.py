@@ -8,8 +8,7 @@ import gc
 import os
 import sys
 import threading
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -17,14 +16,15 @@ import pytest
 from numpy.typing import NDArray
 from tests.engine.bench import Bench, simulated
 from tests.engine.estimator_files import write
+from tests.patience import wait_for
 
+from faintspot.base.files import Closing
 from faintspot.engine.settings.estimators import EstimatorTrial
 
 pytestmark = pytest.mark.slow
 
 TIMES = int(os.environ.get("FAINTSPOT_LEAK_TIMES", "1"))
 FEW = max(50, 20 * TIMES)
-PATIENCE_S = 10.0  # for threads that are about to end
 FIRST = 12  # changes before the count begins: everything is compiled, and the heap has its size
 
 
@@ -40,7 +40,7 @@ def held() -> dict[str, int]:
     }
 
 
-class Changing:
+class Changing(Closing):
     """An engine, a camera that sends a frame after every change, and what the changes left behind."""
 
     def __init__(self) -> None:
@@ -49,6 +49,8 @@ class Changing:
         self.bench.attached()
         self._data: NDArray[np.uint16] = simulated(4)
         self._sent = 0
+        for _ in range(500):  # until dark sub-apertures have been looked for
+            self.send()
 
     def send(self) -> None:
         self.bench.send(self.ring, self._sent, self._data[self._sent % 4])
@@ -68,27 +70,19 @@ class Changing:
         gc.collect()
         gc.freeze()
         gc.disable()
-        before = held()
-        for number in range(FIRST, FIRST + count):
-            change(number)
-            self.send()
-        end = time.monotonic() + PATIENCE_S
-        while held()["threads"] > before["threads"] + 1 and time.monotonic() < end:
-            time.sleep(0.01)
-        return {name: value - before[name] for name, value in held().items()}
+        try:
+            before = held()
+            for number in range(FIRST, FIRST + count):
+                change(number)
+                self.send()
+            wait_for(lambda: held()["threads"] <= before["threads"] + 1)
+            return {name: value - before[name] for name, value in held().items()}
+        finally:
+            gc.enable()
+            gc.unfreeze()
 
     def close(self) -> None:
-        gc.enable()
-        gc.unfreeze()
         self.bench.close()
-
-
-@pytest.fixture
-def changing() -> Iterator[Changing]:
-    pytest.importorskip("pyshmem")
-    changing = Changing()
-    yield changing
-    changing.close()
 
 
 def assert_nothing(left: dict[str, int], count: int, bytes_each: int) -> None:
@@ -99,44 +93,33 @@ def assert_nothing(left: dict[str, int], count: int, bytes_each: int) -> None:
     assert left["imported"] <= 3, left
 
 
-def test_frames_alone_leave_no_memory_behind(changing: Changing) -> None:
-    """Two thousand frames take less than 1 MB."""
-    assert_nothing(changing.left_behind(lambda number: None, 2000), 0, 0)
+def test_nothing_is_left_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of frames alone, changes of settings, versions of an estimator's file, and cameras.
 
-
-def test_changes_of_settings(changing: Changing) -> None:
-    """A pipeline that stays takes 400 kB here; a thousand entries of the history, 1 kB each, are bounded."""
-
-    def change(number: int) -> None:
-        where = None if number % 2 else [0, 3, 7]
-        changing.bench.engine.live.propose({"noise_std": 0.5 + number % 50 / 50}, where)
-
-    count = 200 * TIMES
-    left = changing.left_behind(change, count)
-    assert changing.bench.engine.live.change_number >= count
-    assert_nothing(left, min(count, 1000), 2000)
-
-
-def test_swaps_of_an_estimator(changing: Changing, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Every one is another version of its file, in use; the trial in another process is left out."""
-    # Its frame comes after the change.
-    monkeypatch.setattr("faintspot.engine.settings.estimators.EFFECT_TIMEOUT_S", 0.0)
+    A thousand entries of the history, 1 kB each, are bounded. The trial in another process is left out.
+    """
+    pytest.importorskip("pyshmem")
+    monkeypatch.setattr("faintspot.engine.settings.estimators.EFFECT_TIMEOUT_S", 0.0)  # the frame comes later
     monkeypatch.setattr(EstimatorTrial, "elsewhere", EstimatorTrial.here)
-    estimators, live = changing.bench.engine.estimators, changing.bench.engine.live
-    estimators.load(str(write(tmp_path, "return sensor.zero")))
-    live.propose({"estimator": "mine"})
+    with Changing() as changing:
+        engine = changing.bench.engine
+        estimators, live = engine.estimators, engine.live
 
-    def change(number: int) -> None:
-        estimators.load(str(write(tmp_path, f"return sensor.zero + {number % 7} / 10")), replace=True)
+        def change_settings(number: int) -> None:
+            where = None if number % 2 else [0, 3, 7]
+            live.propose({"noise_std": 0.5 + number % 50 / 50}, where)
 
-    count = FEW
-    assert_nothing(changing.left_behind(change, count), count, 1000)
-    assert estimators.fault is None
-    estimators.unload("mine")
+        def swap(number: int) -> None:
+            estimators.load(str(write(tmp_path, f"return sensor.zero + {number % 7} / 10")), replace=True)
 
-
-def test_restarts_of_the_camera(changing: Changing) -> None:
-    count = FEW
-    left = changing.left_behind(lambda number: changing.restart_camera(), count)
-    assert changing.bench.engine.counters.source_restarts >= count
-    assert_nothing(left, count, 1000)
+        assert_nothing(changing.left_behind(lambda number: None, 1000), 0, 0)
+        count = 200 * TIMES
+        assert_nothing(changing.left_behind(change_settings, count), min(count, 1000), 2000)
+        assert live.change_number >= count
+        estimators.load(str(write(tmp_path, "return sensor.zero")))
+        live.propose({"estimator": "mine"})
+        assert_nothing(changing.left_behind(swap, FEW), FEW, 1000)
+        assert estimators.fault is None
+        estimators.unload("mine")
+        assert_nothing(changing.left_behind(lambda number: changing.restart_camera(), FEW), FEW, 1000)
+        assert engine.counters.source_restarts >= FEW
