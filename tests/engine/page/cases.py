@@ -11,6 +11,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from tornado.httpclient import HTTPRequest
+from tornado.websocket import WebSocketClientConnection, websocket_connect
 
 from faintspot.engine.page.client_requests import Access
 from faintspot.engine.page.page_state import Batch, BatchSource, Picture
@@ -98,46 +100,30 @@ def served(
     return asyncio.run(work())
 
 
-class Refused(Exception):
-    """The server does not take this client: the status is its argument."""
-
-
 class Client:
-    """A web socket by hand: what comes is taken from the socket only when the test reads."""
+    """A web socket."""
 
-    def __init__(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        self._reader, self._writer = reader, writer
-        self.close_code: int | None = None
+    def __init__(self, connection: WebSocketClientConnection) -> None:
+        assert connection.protocol is not None
+        assert connection.protocol.stream is not None
+        self._connection, self._stream = connection, connection.protocol.stream
+        _opened.append(self)
 
     async def send(self, message: str | bytes) -> None:
-        binary = isinstance(message, bytes)
-        data = message if isinstance(message, bytes) else message.encode("utf-8", "surrogatepass")
-        size = len(data)
-        length = bytes([0x80 | size]) if size < 126 else b"\xfe" + size.to_bytes(2)
-        self._writer.write(bytes([0x82 if binary else 0x81]) + length + bytes(4) + data)  # masked with zeros
-        await self._writer.drain()
+        await self._connection.write_message(message, binary=isinstance(message, bytes))
 
     async def read(self) -> str | bytes | None:
         """Return the next message, None when the server has closed."""
-        while True:
-            try:
-                kind, size = await self._reader.readexactly(2)
-                if size >= 126:
-                    size = int.from_bytes(await self._reader.readexactly(2 if size == 126 else 8))
-                data = await self._reader.readexactly(size)
-            except (asyncio.IncompleteReadError, ConnectionError):
-                self.close_code = 1006
-                return None
-            if kind == 0x88:
-                self.close_code = int.from_bytes(data[:2])
-                self.close()
-                return None
-            if kind in (0x81, 0x82):
-                return data.decode() if kind == 0x81 else data
+        return await self._connection.read_message()
+
+    @property
+    def close_code(self) -> int:
+        return self._connection.close_code or 1006
 
     def close(self) -> None:
         """Be gone, as a client that has died."""
-        self._writer.close()
+        self._connection.close()
+        self._stream.close()  # without waiting for the server
 
 
 def next_batch(source: BatchSource) -> Batch:
@@ -150,24 +136,9 @@ def next_batch(source: BatchSource) -> Batch:
 async def connected(server: LiveServer, **headers: str) -> Client:
     """Open a web socket as the page's own script does, but for these headers; "": without it."""
     host = f"127.0.0.1:{server.port}"
-    sent = {
-        "Host": host,
-        "Origin": f"http://{host}",
-        "Upgrade": "websocket",
-        "Connection": "Upgrade",
-        "Sec-WebSocket-Key": "AAAAAAAAAAAAAAAAAAAAAA==",
-        "Sec-WebSocket-Version": "13",
-    } | headers
-    reader, writer = await asyncio.open_connection("127.0.0.1", server.port, limit=4096)
-    client = Client(reader, writer)
-    _opened.append(client)
-    lines = "".join(f"{name}: {value}\r\n" for name, value in sent.items() if value)
-    writer.write(f"GET /stream HTTP/1.1\r\n{lines}\r\n".encode())
-    status = int((await reader.readline()).split()[1])
-    if status != 101:
-        raise Refused(status)
-    await reader.readuntil(b"\r\n\r\n")
-    return client
+    sent = {"Host": host, "Origin": f"http://{host}"} | headers
+    present = {name: value for name, value in sent.items() if value or name == "Host"}
+    return Client(await websocket_connect(HTTPRequest(f"ws://{host}/stream", headers=present)))
 
 
 async def asked(client: Client, **request: Any) -> dict[str, Any]:

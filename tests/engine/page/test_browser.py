@@ -167,7 +167,7 @@ def drawn(page: Any, canvas: str) -> int:
 
 def test_everything_is_drawn_and_goes_on(open_page: Any, server: LiveServer) -> None:
     page = open_page(server.url)
-    assert page.locator("#state").inner_text() == "● live" or page.locator("#state").inner_text() == "live"
+    assert page.locator("#state").inner_text() in ("● live", "live")
     until(page, "document.getElementById('raw-caption').textContent !== ''")
     until(page, "document.getElementById('histogram-caption').textContent !== ''")
     for canvas in ("raw", "denoised", "slopes", "flux", "valid", "latency", "histogram", "rms", "mean-flux"):
@@ -214,90 +214,80 @@ def test_settings_are_changed_and_errors_stand_beside_their_field(
     until(page, "document.getElementById('apply').disabled")
 
 
-def test_loop_is_closed_and_its_gain_set(open_page: Any, server: LiveServer, engine: Running) -> None:
+def test_loop_methods_and_recording(
+    open_page: Any, server: LiveServer, engine: Running, folder: Path
+) -> None:
     page = open_page(server.url)
-    page.locator("#loop-state").filter(has_text="open: diverged").wait_for()
-    page.locator("#gain").fill("3")
-    page.locator("#gain").press("Enter")
-    page.locator("#loop-answer[data-ok=false]").filter(has_text="gain = 3: expected").wait_for()
-    page.locator("#gain").fill("0.3")
-    page.locator("#gain").press("Enter")
-    page.locator("#loop-answer").filter(has_text="open, gain 0.3").wait_for()
+
+    def enter(field: str, value: str) -> None:
+        page.locator(field).fill(value)
+        page.locator(field).press("Enter")
+
+    def says(place: str, text: str) -> None:
+        page.locator(place).filter(has_text=text).wait_for()
+
+    says("#loop-state", "open: diverged")
+    enter("#gain", "3")
+    says("#loop-answer[data-ok=false]", "gain = 3: expected")
+    enter("#gain", "0.3")
+    says("#loop-answer", "open, gain 0.3")
     page.locator("#loop-close").click()
-    page.locator("#loop-state").filter(has_text="closed").wait_for()
+    says("#loop-state", "closed")
     assert engine.loop == {"state": "closed", "gain": 0.3, "opened_because": None}
-
-
-def test_methods_take_turns_and_are_compared(open_page: Any, server: LiveServer, engine: Running) -> None:
-    page = open_page(server.url)
-    page.locator("#methods-text").fill("none,nothing")
-    page.locator("#methods-text").press("Enter")
-    page.locator("#interleave-answer[data-ok=false]").filter(has_text="'nothing': expected").wait_for()
+    enter("#methods-text", "none,nothing")
+    says("#interleave-answer[data-ok=false]", "'nothing': expected")
     page.locator("#methods-text").fill("none,tv")
-    page.locator("#every").fill("5")
-    page.locator("#every").press("Enter")
-    page.locator("#interleave-answer").filter(has_text="frame").wait_for()
+    enter("#every", "5")
+    says("#interleave-answer", "frame")
     page.locator("#methods tbody tr").nth(1).wait_for()
     assert page.locator("#methods tbody th").all_inner_texts() == ["none", "tv"]
     assert engine.engine.status()["methods"] == ["none", "tv"]
-
-
-def test_recording_from_the_page(open_page: Any, server: LiveServer, folder: Path) -> None:
-    page = open_page(server.url)
-    page.locator("#file").fill("../night.zarr")
-    page.locator("#file").press("Enter")
-    page.locator("#record-answer[data-ok=false]").filter(has_text="without a folder").wait_for()
+    enter("#file", "../night.zarr")
+    says("#record-answer[data-ok=false]", "without a folder")
     page.locator("#file").fill("night.zarr")
     page.locator("#record").click()
     until(page, "!document.getElementById('stop-recording').disabled")
-    page.wait_for_timeout(500)
+    page.wait_for_timeout(300)
     page.locator("#stop-recording").click()
-    page.locator("#record-answer").filter(has_text="stopped").wait_for()
+    says("#record-answer", "stopped")
     assert len(read_telemetry(folder / "night.zarr").frame) > 0
 
 
-def test_without_the_token_one_may_only_watch(open_page: Any, server: LiveServer) -> None:
-    page = open_page(server.url.partition("#")[0])
-    assert page.locator("#controls").is_hidden()
-    page.locator("#token").fill("guess")
-    page.locator("#token").press("Enter")
-    page.locator("#token-error").filter(has_text="wrong token").wait_for()
-    assert page.locator("#controls").is_hidden()
-    page.locator("#token").fill(server.access.token)
-    page.locator("#token").press("Enter")
-    page.locator("#setting-noise_std").wait_for()
-    assert page.locator("#token-form").is_hidden()
-    page.reload()
-    page.locator("#setting-noise_std").wait_for()  # the tab remembers
-
-
-def test_private_page_shows_nothing_before_the_token(open_page: Any, engine: Running, tmp_path: Path) -> None:
-    with served(serve, engine.name, folder=tmp_path, private=True) as server:
-        page = open_page(server.url.partition("#")[0], drawn=False)
-        page.locator("#token-error").filter(has_text="needs the token").wait_for()
-        assert page.locator("#tiles dd").count() == 0
+@pytest.mark.parametrize("private", [False, True])
+def test_without_the_token_one_may_only_watch(
+    open_page: Any, engine: Running, tmp_path: Path, private: bool
+) -> None:
+    """Or not even that."""
+    with served(serve, engine.name, folder=tmp_path, private=private) as server:
+        page = open_page(server.url.partition("#")[0], drawn=not private)
+        assert page.locator("#controls").is_hidden()
+        if private:
+            page.locator("#token-error").filter(has_text="needs the token").wait_for()
+            assert page.locator("#tiles dd").count() == 0
+        else:
+            page.locator("#token").fill("guess")
+            page.locator("#token").press("Enter")
+            page.locator("#token-error").filter(has_text="wrong token").wait_for()
+            assert page.locator("#controls").is_hidden()
         page.locator("#token").fill(server.access.token)
         page.locator("#token").press("Enter")
         page.locator("#setting-noise_std").wait_for()
+        assert page.locator("#token-form").is_hidden()
+        page.reload()
+        page.locator("#setting-noise_std").wait_for()  # the tab remembers
         until(page, "document.getElementById('raw-caption').textContent !== ''")
 
 
-def test_telephone_light_and_dark(open_page: Any, server: LiveServer) -> None:
-    grounds = []
-    for scheme in ("light", "dark"):
-        page = open_page(server.url, viewport=TELEPHONE, color_scheme=scheme)
-        page.locator("#setting-noise_std").wait_for()
-        assert page.evaluate("document.documentElement.scrollWidth") <= TELEPHONE["width"]
-        grounds.append(page.evaluate("getComputedStyle(document.body).backgroundColor"))
-        for control in page.locator("button:visible, input:visible, select:visible").all():
-            box = control.bounding_box()
-            assert box["x"] >= 0
-            assert box["x"] + box["width"] <= TELEPHONE["width"]
+def test_a_telephone_by_keyboard_and_every_control_has_a_name(open_page: Any, server: LiveServer) -> None:
+    page = open_page(server.url, viewport=TELEPHONE, color_scheme="dark")
+    page.locator("#setting-noise_std").wait_for()
+    assert page.evaluate("document.documentElement.scrollWidth") <= TELEPHONE["width"]
+    for control in page.locator("button:visible, input:visible, select:visible").all():
+        box = control.bounding_box()
+        assert 0 <= box["x"] <= TELEPHONE["width"] - box["width"]
+    light = open_page(server.url)
+    grounds = [each.evaluate("getComputedStyle(document.body).backgroundColor") for each in (page, light)]
     assert grounds[0] != grounds[1]
-
-
-def test_everything_is_reached_by_keyboard_and_has_a_name(open_page: Any, server: LiveServer) -> None:
-    page = open_page(server.url)
     page.locator("#setting-noise_std").wait_for()
     wanted = page.evaluate(
         """[...document.querySelectorAll("button, input, select")]
@@ -317,9 +307,3 @@ def test_everything_is_reached_by_keyboard_and_has_a_name(open_page: Any, server
     page.locator("#hold").focus()
     page.keyboard.press("Space")
     assert page.locator("#hold").get_attribute("aria-pressed") == "true"
-
-
-def test_engine_that_is_not_there_is_waited_for(open_page: Any, tmp_path: Path) -> None:
-    with served(serve, "fs_test_nobody", folder=tmp_path) as server:
-        page = open_page(server.url)
-        page.locator("#state").filter(has_text="waiting for the engine fs_test_nobody").wait_for()

@@ -1,5 +1,5 @@
-import time
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 from uuid import uuid4
@@ -9,6 +9,7 @@ import pytest
 pytest.importorskip("zarr")
 
 from tests.engine.telemetry_cases import LAYOUT, Engine
+from tests.patience import wait_for
 
 from faintspot.base.errors import InputError
 from faintspot.engine.page.client_requests import EngineRequests, answered
@@ -64,18 +65,12 @@ def test_client_requests_reach_the_control_channel_as_the_command_line_sends_the
     [
         ({"do": "set", "changes": ["noise_std=-1"]}, "noise_std = -1: expected a number of at least 0"),
         ({"do": "set", "changes": ["noise_std"]}, "'noise_std': expected NAME=VALUE"),
-        ({"do": "set", "changes": "noise_std=1"}, "changes: expected a list"),
         ({"do": "set", "changes": [1]}, "changes: expected a list"),
-        ({"do": "set", "changes": []}, "settings: expected at least one"),
         ({"do": "set", "changes": ["a=1"] * 101}, "changes: expected at most 100"),
-        ({"do": "set", "changes": ["a=1"], "subapertures": [1]}, "changes: expected at most 100"),
         ({"do": "set", "changes": ["a=1"], "subapertures": "x"}, "sub-apertures 'x': expected numbers"),
-        ({"do": "stop"}, "do = 'stop': expected one of set, interleave, loop, record"),
         ({"do": "load", "source": "x.py"}, "do = 'load': expected one of"),
         ({"do": "record", "file": "../night.zarr"}, "file = '../night.zarr': expected a name such as"),
-        ({"do": "record", "file": "/tmp/night.zarr"}, "without a folder"),
         ({"do": "record", "file": "night"}, "expected a name such as night.zarr"),
-        ({"do": "record", "file": None}, "expected a name such as night.zarr"),
         ({"do": "record", "file": "night.zarr"}, "no such ring of telemetry"),
     ],
 )
@@ -88,30 +83,19 @@ def test_what_is_wrong_is_said_in_one_line(
     assert "\n" not in answer["error"]
 
 
-def test_without_an_engine_client_requests_are_refused(tmp_path: Path) -> None:
-    answer = ask(EngineRequests(NAME, tmp_path), do="set", changes=["noise_std=1"])
-    assert answer["error"].startswith(f"no engine runs under the name {NAME}")
-
-
 def test_recording_from_the_page(tmp_path: Path) -> None:
-    engine = Engine(TelemetryRing.create(NAME, LAYOUT))
-    engine.start()
     client_requests = EngineRequests(NAME, tmp_path)
-    try:
+    answer = ask(client_requests, do="set", changes=["noise_std=1"])
+    assert answer["error"].startswith(f"no engine runs under the name {NAME}")
+    with Engine(TelemetryRing.create(NAME, LAYOUT)), closing(client_requests):
         assert ask(client_requests, do="stop_recording")["text"] == "nothing is being recorded"
-        assert ask(client_requests, do="record", file="night.zarr") == {
-            "ok": True,
-            "text": "recording to night.zarr",
-        }
+        answer = ask(client_requests, do="record", file="night.zarr")
+        assert answer == {"ok": True, "text": "recording to night.zarr"}
         refused = ask(client_requests, do="record", file="other.zarr")
         assert "a recording is already running" in refused["error"]
-        while client_requests.recording.status()["frames"] < 50:
-            time.sleep(0.01)
+        wait_for(lambda: client_requests.recording.status()["frames"] >= 50)
         answer = ask(client_requests, do="stop_recording")
         assert answer["text"].startswith("night.zarr: ")
         assert not client_requests.recording.status()["running"]
         assert len(read_telemetry(tmp_path / "night.zarr").frame) >= 50
         assert "already exists" in ask(client_requests, do="record", file="night.zarr")["error"]
-    finally:
-        engine.stop()
-        client_requests.close()

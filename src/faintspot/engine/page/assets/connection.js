@@ -46,7 +46,8 @@ export class Connection {
   /** Identify this client. */
   async hello() {
     const reply = await this.ask("hello", { token: this.token });
-    if (!reply.ok && this.token) sessionStorage.removeItem(KEY);
+    const isRefused = !reply.ok && this.socket.readyState === WebSocket.OPEN;  // not merely lost
+    if (isRefused && this.token) sessionStorage.removeItem(KEY);
     this.handlers.onAccess(reply);
     return reply;
   }
