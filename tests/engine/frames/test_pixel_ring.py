@@ -7,7 +7,6 @@ import os
 import stat
 import threading
 import time
-from collections.abc import Iterator
 from multiprocessing.queues import Queue
 from multiprocessing.synchronize import Barrier
 
@@ -32,9 +31,9 @@ def content(frame: int) -> np.ndarray:
     return np.broadcast_to(frame * 1000 + ROW_NUMBERS, SHAPE)
 
 
-def write(name: str, n_frames: int, pause_s: float, slots: int, meeting: Barrier) -> None:
+def write(name: str, n_frames: int, meeting: Barrier) -> None:
     """Write frames by blocks of rows, from when all readers are there until all have finished."""
-    with PixelRing.create(name, SHAPE, np.int32, slots=slots) as ring:
+    with PixelRing.create(name, SHAPE, np.int32, slots=4) as ring:
         meeting.wait(LIMIT_S)
         for number in range(n_frames):
             slot, values = ring.begin(), content(number)
@@ -42,8 +41,6 @@ def write(name: str, n_frames: int, pause_s: float, slots: int, meeting: Barrier
                 slot[first : first + 3] = values[first : first + 3]
                 ring.rows_ready(first + 3)
             ring.end()
-            if pause_s:
-                time.sleep(pause_s)
         meeting.wait(LIMIT_S)
 
 
@@ -78,16 +75,15 @@ def attached(name: str) -> PixelRing:
     raise TimeoutError(name)
 
 
-@pytest.mark.parametrize("pause_s", [0.0, 1e-3])
-def test_rows_that_progress_names_are_there_for_two_readers(name: str, pause_s: float) -> None:
-    spawn, n_frames = multiprocessing.get_context("spawn"), 400 if pause_s else 20_000
+def test_rows_that_progress_names_are_there_for_two_readers(name: str) -> None:
+    spawn, n_frames = multiprocessing.get_context("spawn"), 10_000
     answers: Queue[tuple[int, int, int]] = spawn.Queue()
     meeting = spawn.Barrier(3)
     reading = (name, n_frames - 1, answers, meeting)
     with (
         process(read, *reading) as first,
         process(read, *reading) as second,
-        process(write, name, n_frames, pause_s, 4, meeting) as writer,
+        process(write, name, n_frames, meeting) as writer,
     ):
         results = [answers.get(timeout=LIMIT_S) for _ in range(2)]
         for each in (first, second, writer):
@@ -99,23 +95,6 @@ def test_rows_that_progress_names_are_there_for_two_readers(name: str, pause_s: 
         assert looks > 20
         assert wrong == 0
     assert not (FOLDER / name).exists()
-
-
-def test_every_frame_in_turn_from_another_process(name: str) -> None:
-    spawn = multiprocessing.get_context("spawn")
-    meeting = spawn.Barrier(2)
-    with process(write, name, 100, 2e-3, 100, meeting) as writer:
-        ring = attached(name)
-        meeting.wait(LIMIT_S)
-        for frame in range(100):
-            wait_for(lambda frame=frame: ring.last_row_time_ns(frame) > 0)
-            np.testing.assert_array_equal(ring.slot(frame), content(frame))
-            assert ring.intact(frame)
-            assert ring.last_row_time_ns(frame) <= time.monotonic_ns()
-        meeting.wait(LIMIT_S)
-        writer.join(LIMIT_S)
-    assert ring.closed
-    assert is_stale(ring)
 
 
 def test_rows_frames_and_laps(name: str) -> None:
@@ -148,26 +127,6 @@ def test_rows_frames_and_laps(name: str) -> None:
         assert not reader.cells.flags.writeable
 
 
-def test_repeats_skips_and_short_frames_are_seen(name: str) -> None:
-    with PixelRing.create(name, SHAPE, np.float32) as ring, PixelRing.attach(name) as reader:
-        ring.publish(np.full(SHAPE, 1.0), 5)
-        assert reader.intact(5, 1)
-        ring.publish(np.full(SHAPE, 2.0), 5)
-        assert reader.intact(5)
-        assert not reader.intact(5, 1)
-        assert reader.arrivals == 2
-        ring.publish(np.full(SHAPE, 3.0), 50)
-        assert reader.progress() == (50, SHAPE[0])
-        assert not reader.intact(49)
-        ring.begin(51)
-        ring.rows_ready(4)
-        ring.begin(52)  # 51 was cut short
-        assert reader.last_row_time_ns(51) == 0
-        assert reader.progress() == (52, 0)
-        ring.publish(np.zeros(SHAPE), 3)  # the camera counts anew
-        assert reader.progress() == (3, SHAPE[0])
-
-
 def test_progress_does_not_mix_two_frames(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """A frame that begins between the looks at number and rows: it looks again."""
 
@@ -187,11 +146,6 @@ def test_wrong_use_by_the_writer(name: str) -> None:
     with PixelRing.create(name, SHAPE, np.float32) as ring:
         with refused("rows = 1"):
             ring.rows_ready(1)
-        with refused("shape"):
-            ring.publish(np.zeros((3, 3)))
-        assert ring.progress() == (-1, 0)
-        with refused("frame_number = -1"):
-            ring.begin(-1)
         ring.begin()
         ring.rows_ready(8)
         for rows in (7, SHAPE[0] + 1):
@@ -207,6 +161,9 @@ def test_wrong_use_by_the_writer(name: str) -> None:
 def test_closing_tells_readers_and_keeps_their_memory(name: str) -> None:
     ring = PixelRing.create(name, SHAPE, np.float32)
     reader = PixelRing.attach(name)
+    assert stat.S_IMODE((FOLDER / name).stat().st_mode) == 0o600
+    assert [path for path in FOLDER.iterdir() if name in path.name] == [FOLDER / name]
+    assert not is_stale(reader)
     ring.publish(np.full(SHAPE, 3.0))
     view = reader.slot(0)
     reader.close()
@@ -219,29 +176,16 @@ def test_closing_tells_readers_and_keeps_their_memory(name: str) -> None:
     np.testing.assert_array_equal(view, 3.0)  # memory in use stays
     assert not (FOLDER / name).exists()
     # A writer of the same name that came later keeps its ring when the first one closes once more.
-    with PixelRing.create(name, SHAPE, np.float32):
+    with PixelRing.create(name, SHAPE, np.float32) as second:
+        second.publish(np.ones(SHAPE))
         ring.close()
         assert (FOLDER / name).exists()
+        assert is_stale(reader)
+        assert reader.progress() == (0, SHAPE[0])
 
 
-def test_only_the_same_user_can_open_it(name: str) -> None:
-    with PixelRing.create(name, SHAPE, np.float32):
-        assert stat.S_IMODE((FOLDER / name).stat().st_mode) == 0o600
-        assert [path for path in FOLDER.iterdir() if name in path.name] == [FOLDER / name]
-
-
-def test_a_second_writer_is_refused(name: str) -> None:
-    with PixelRing.create(name, SHAPE, np.float32) as ring:
-        ring.publish(np.full(SHAPE, 3.0))
-        with refused(f"process {os.getpid()}"):
-            PixelRing.create(name, (8, 8), np.uint16)
-        np.testing.assert_array_equal(PixelRing.attach(name).slot(0), 3.0)
-        assert not is_stale(ring)
-
-
-@pytest.fixture
-def killed_writer(name: str) -> Iterator[None]:
-    """Start a writer, wait for its first frame, kill it (-9) and leave it a zombie."""
+def test_the_ring_of_a_killed_writer_is_replaced(name: str) -> None:
+    """Of many that do so one wins. It may be cut; a living one is not replaced."""
     code = (
         "import time, numpy as np\n"
         "from faintspot.engine.frames.pixel_ring import PixelRing\n"
@@ -249,51 +193,22 @@ def killed_writer(name: str) -> Iterator[None]:
         f"ring.publish(np.full({SHAPE}, 9.0))\n"
         "time.sleep(100)\n"
     )
-    writer = start(code)
-    try:
-        ring = attached(name)
-        wait_for(lambda: ring.last_row_time_ns(0) > 0)
-        assert not is_stale(ring)
+    with start(code) as writer:
+        reader = attached(name)
+        wait_for(lambda: reader.last_row_time_ns(0) > 0)
         with refused(f"process {writer.pid}"):
-            PixelRing.create(name, SHAPE, np.float32)
+            PixelRing.create(name, (8, 8), np.uint16)
+        assert not is_stale(reader)
         writer.kill()
-        wait_for(lambda: is_stale(ring))
-        assert not ring.closed
-        yield
-    finally:
-        writer.kill()
-        writer.communicate()
-
-
-@pytest.mark.usefixtures("killed_writer")
-def test_the_ring_of_a_killed_writer_is_replaced(name: str) -> None:
-    reader = PixelRing.attach(name)
-    with PixelRing.create(name, (8, 8), np.uint16) as ring:
-        assert is_stale(reader)
-        np.testing.assert_array_equal(reader.slot(0), 9.0)  # the old memory stays as it was
-        again = PixelRing.attach(name)
-        assert again.identity == ring.identity != reader.identity
-        assert again.shape == (8, 8)
-        assert not is_stale(again)
-
-
-@pytest.mark.usefixtures("killed_writer")
-def test_a_cut_ring_of_a_killed_writer_is_replaced(name: str) -> None:
-    os.truncate(FOLDER / name, 8192)
-    with refused("8192"):
-        PixelRing.attach(name)
-    with PixelRing.create(name, SHAPE, np.float32):
-        assert not is_stale(PixelRing.attach(name))
-
-
-@pytest.mark.usefixtures("killed_writer")
-def test_of_many_that_replace_a_dead_ring_one_wins(name: str) -> None:
+        wait_for(lambda: is_stale(reader))  # a zombie: nobody has asked for what is left of it
+        assert not reader.closed
+    left = (FOLDER / name).read_bytes()
     made: list[PixelRing] = []
     said: list[str] = []
 
     def create() -> None:
         try:
-            made.append(PixelRing.create(name, SHAPE, np.float32))
+            made.append(PixelRing.create(name, (8, 8), np.uint16))
         except InputError as error:
             said.append(str(error))
 
@@ -302,18 +217,17 @@ def test_of_many_that_replace_a_dead_ring_one_wins(name: str) -> None:
         thread.start()
     for thread in threads:
         thread.join()
-    assert len(made) == 1
-    assert len(said) == 7
-    assert PixelRing.attach(name).identity == made[0].identity
+    assert (len(made), len(said)) == (1, 7)
+    again = PixelRing.attach(name)
+    assert again.identity == made[0].identity != reader.identity
+    assert again.shape == (8, 8)
+    assert not is_stale(again)
+    assert is_stale(reader)
+    np.testing.assert_array_equal(reader.slot(0), 9.0)  # the old memory stays as it was
     made[0].close()
-
-
-def test_a_reader_sees_that_the_writer_came_again(name: str) -> None:
-    first = PixelRing.create(name, SHAPE, np.float32)
-    reader = PixelRing.attach(name)
-    assert not is_stale(reader)
-    first.close()
-    with PixelRing.create(name, SHAPE, np.float32) as second:
-        second.publish(np.ones(SHAPE))
-        assert is_stale(reader)
-        assert reader.progress() == (-1, 0)
+    (FOLDER / name).write_bytes(left[:8192])
+    (FOLDER / name).chmod(0o600)
+    with refused("8192"):
+        PixelRing.attach(name)
+    with PixelRing.create(name, SHAPE, np.float32):
+        assert not is_stale(PixelRing.attach(name))

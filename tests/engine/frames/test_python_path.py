@@ -1,9 +1,7 @@
 """An estimator in NumPy in the engine: the pipeline's slopes, and no fault beyond its frame."""
 
-import gc
 import threading
 import time
-import weakref
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -15,7 +13,6 @@ from tests.patience import wait_for
 from tests.refusals import refused
 
 import faintspot as fs
-from faintspot.base.flags import INVALID
 from faintspot.engine.frames.frame_path import Progress
 from faintspot.engine.frames.python_path import PythonPath, call_is_under_way, call_within, end_thread, tried
 from faintspot.engine.frames.workers import SlopePrior
@@ -100,20 +97,6 @@ def test_slopes_are_those_of_the_pipeline() -> None:
     assert_same(source.measure(source.data), source.pipeline(source.data, prior=expected))
 
 
-def test_a_frame_that_fails_is_flagged() -> None:
-    """The frames before and after it are measured."""
-    source = Source(fail)
-    for _ in range(2):
-        for frame, bad in ((source.data, False), (source.bright, True), (source.bright, True)):
-            slopes = source.measure(frame)
-            assert source.path.failed == bad
-            assert np.all((slopes.flags & INVALID != 0) == bad)
-            assert np.all(np.isfinite(slopes.vector))
-            assert_same(slopes, source.pipeline(frame))
-    assert source.path.fault is None
-    assert source.pipeline.plan.prepared.faults == 4
-
-
 def test_single_subapertures_that_are_not_usable() -> None:
     source = Source(partly)
     slopes = source.measure(source.bright)
@@ -171,16 +154,6 @@ def test_trial_refuses_failing_and_slow_estimators() -> None:
         tried(make, settings(None), 1e-9)
 
 
-def test_a_path_that_is_forgotten_ends_its_thread() -> None:
-    source = Source(None)
-    thread, path = source.path._thread, weakref.ref(source.path)
-    del source
-    gc.collect()
-    assert path() is None
-    thread.join(GENEROUS_S)
-    assert not thread.is_alive()
-
-
 PATIENCE_S = 10.0
 
 
@@ -189,24 +162,15 @@ def forever() -> None:
         pass
 
 
-def test_what_comes_back_in_time() -> None:
+def test_calls_that_come_back_in_time_and_others() -> None:
     assert call_within(PATIENCE_S, "sum", lambda *numbers: sum(numbers), 1, 2) == 3
     assert call_within(PATIENCE_S, "nothing", lambda: None) is None
     assert call_within(PATIENCE_S, "itself", call_is_under_way)
-
-
-def test_its_errors_are_the_callers() -> None:
     with pytest.raises(ValueError, match="two"):
         call_within(PATIENCE_S, "number", int, "two")
-
-
-def test_what_does_not_come_back() -> None:
     known = set(threading.enumerate())
     with pytest.raises(fs.InputError, match=r"^loop: did not return within 0\.05 s$"):
         call_within(0.05, "loop", forever)
     wait_for(lambda: not set(threading.enumerate()) - known)
     assert not call_is_under_way()
-
-
-def test_a_thread_that_has_not_begun_is_left_alone() -> None:
-    end_thread(threading.Thread(target=forever))
+    end_thread(threading.Thread(target=forever))  # one that has not begun is left alone

@@ -2,7 +2,7 @@
 
 import threading
 import time
-from collections.abc import Iterator
+from contextlib import closing
 
 import numpy as np
 import pytest
@@ -11,70 +11,44 @@ from tests.patience import LIMIT_S, wait_for
 from faintspot.engine.frames.workers import SlopePrior, Workers
 
 
-@pytest.fixture
-def workers() -> Iterator[Workers]:
-    made = Workers(2)
-    yield made
-    made.close()
-
-
 @pytest.mark.slow
-def test_every_share_is_done_once(workers: Workers) -> None:
+def test_every_share_is_done_once_whatever_became_of_the_last() -> None:
+    """After one that did not come to its end, sleep, and the death of a thread, whose share is given up."""
     done: list[tuple[int, int]] = []
-    for job in range(100):
-
-        def task(share: int, job: int = job) -> bool:
-            done.append((job, share))
-            return True
-
-        workers.post(task)
-        assert workers.wait()
-    assert sorted(done) == [(job, share) for job in range(100) for share in (1, 2)]
-
-
-@pytest.mark.slow
-def test_a_share_that_did_not_come_to_its_end(workers: Workers) -> None:
-    workers.post(lambda share: share != 2)
-    assert not workers.wait()
-    workers.post(lambda share: True)
-    assert workers.wait()
-
-
-@pytest.mark.slow
-def test_they_sleep_and_wake(workers: Workers) -> None:
-    workers.park()
-    time.sleep(0.01)
-    workers.wake()
-    workers.post(lambda share: True)
-    assert workers.wait()
-
-
-@pytest.mark.slow
-def test_a_dead_one_is_replaced(workers: Workers) -> None:
-    """Its share is given up, and the next task is whole again."""
+    outcome: list[bool] = []
 
     def deadly(share: int) -> bool:
         if share == 1:
             raise MemoryError("no more")
         return True
 
-    outcome: list[bool] = []
-    workers.post(deadly)
-    waiting = threading.Thread(target=lambda: outcome.append(workers.wait()))
-    waiting.start()
-    wait_for(workers.replace_dead)
-    waiting.join(LIMIT_S)
-    assert outcome == [False]
-    workers.post(lambda share: True)
-    assert workers.wait()
+    with closing(Workers(2, cpus=[0])) as workers:
 
+        def all_do(job: int) -> None:
+            def do(share: int) -> bool:
+                done.append((job, share))
+                return True
 
-@pytest.mark.slow
-def test_pinned_where_there_is_such_a_processor() -> None:
-    workers = Workers(1, cpus=[0])
-    workers.post(lambda share: True)
-    assert workers.wait()
-    workers.close()
+            workers.post(do)
+            assert workers.wait()
+
+        for job in range(100):
+            all_do(job)
+        workers.post(lambda share: share != 2)
+        assert not workers.wait()
+        all_do(100)
+        workers.park()
+        time.sleep(0.01)
+        workers.wake()
+        all_do(101)
+        workers.post(deadly)
+        waiting = threading.Thread(target=lambda: outcome.append(workers.wait()))
+        waiting.start()
+        wait_for(workers.replace_dead)
+        waiting.join(LIMIT_S)
+        assert outcome == [False]
+        all_do(102)
+    assert sorted(done) == [(job, share) for job in range(103) for share in (1, 2)]
 
 
 def test_what_is_expected_and_how_surely() -> None:
