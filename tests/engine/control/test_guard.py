@@ -210,10 +210,3 @@ def test_spots_are_lost_where_their_flux_is_low_when_they_are_displaced(flux: fl
         moved = frame >= 100
         spots.take(np.full(COMMANDS, float(moved)), FLUX * np.float32(flux if moved else 1.0))
     assert spots.lost == lost
-
-
-def test_flux_that_is_not_finite_counts_as_none() -> None:
-    spots = LostSpots(INTERACTION, 10)
-    for _ in range(30):
-        spots.take(np.ones(COMMANDS), np.full(N, np.nan, "f4"))
-    assert not spots.lost

@@ -29,7 +29,7 @@ pytest.importorskip("pyshmem")
 
 pytestmark = pytest.mark.slow
 BRIGHT = 60000
-FAILING = f"if {BRIGHT / 2} < images.max() < {BRIGHT}:\n    {{}}\nreturn sensor.zero + 0.25"
+FAILING = f"if {BRIGHT / 2} < images.max() < {BRIGHT}:\n    time.sleep(60)\nreturn sensor.zero + 0.25"
 
 
 class Camera(Bench):
@@ -82,27 +82,9 @@ def mine(path: Path, **options: Any) -> fs.Settings:
 
 
 @pytest.mark.usefixtures("tried_here")
-def test_a_compiled_estimator(camera: Camera, tmp_path: Path) -> None:
-    path = tmp_path / "compiled.py"
-    path.write_text(
-        "from dataclasses import dataclass\nfrom faintspot.slopes.estimators import register\n"
-        "from faintspot.slopes.estimators.built_in.gravity import CentreOfGravity\n"
-        "@register\n@dataclass(frozen=True, eq=False, kw_only=True)\n"
-        "class Mine(CentreOfGravity):\n    name = 'mine'\n"
-    )
-    camera.ask["load"]({"source": str(path)})
-    camera.change(estimator="mine")
-    camera.assert_measured_with(SETTINGS.replace(estimator="centroid"), camera.shoot())
-    camera.ask["unload"]({"estimator": "mine"})
-    camera.shoot(n=2)
-    camera.assert_measured_with(SETTINGS, camera.shoot())
-
-
-@pytest.mark.usefixtures("tried_here")
-@pytest.mark.parametrize("fault", ["raise RuntimeError('out of order')", "time.sleep(60)"])
-def test_one_that_goes_on_failing_is_given_up(camera: Camera, tmp_path: Path, fault: str) -> None:
+def test_one_that_does_not_return_is_given_up(camera: Camera, tmp_path: Path) -> None:
     """The built-in estimator before takes over with the next frame, with the settings as they are now."""
-    camera.ask["load"]({"source": str(write(tmp_path, FAILING.format(fault)))})
+    camera.ask["load"]({"source": str(write(tmp_path, FAILING))})
     camera.change(estimator="mine")
     camera.change(search_range_px=2.0)
     camera.shoot(camera.bright, n=3)
@@ -113,29 +95,6 @@ def test_one_that_goes_on_failing_is_given_up(camera: Camera, tmp_path: Path, fa
     assert camera.engine.counters.processed == camera.sent
     taken = camera.engine.live.taken()[-1][2]
     assert (taken["estimator"], taken["estimator_fault"]) == ("tv", status["estimator_fault"])
-
-
-@pytest.mark.usefixtures("tried_here")
-def test_what_is_refused_changes_nothing(camera: Camera, tmp_path: Path) -> None:
-    path = write(tmp_path)
-    camera.ask["load"]({"source": str(path)})
-    camera.change(estimator="mine")
-    before = camera.engine.live.change_number
-    write(tmp_path, "return images[1:]")
-    with refused("my_estimator"):
-        camera.ask["load"]({"source": str(path), "replace": True})
-    for fields in ({}, {"source": 3}, {"source": ""}):
-        with refused("source"):
-            camera.ask["load"](dict(fields))
-    write(tmp_path)
-    camera.assert_measured_with(mine(path), camera.shoot())
-    assert camera.engine.live.change_number == before
-    # What passes in the other process may be too slow in this one.
-    write(tmp_path, "time.sleep(0.25)\nreturn sensor.zero")
-    with refused("estimator 'mine'", "us a frame"):
-        camera.ask["load"]({"source": str(path), "replace": True})
-    write(tmp_path)
-    camera.assert_measured_with(mine(path), camera.shoot())
 
 
 @pytest.mark.usefixtures("tried_here")
@@ -187,22 +146,14 @@ def test_settings_change_during_a_trial(
             loading.join(LIMIT_S)
 
 
-@pytest.mark.parametrize("then", ["", "raise ValueError('late')"])
 def test_a_file_that_changes_the_folder_leaves_the_engine_where_it_is(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, then: str
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "other").mkdir()
     monkeypatch.chdir(tmp_path)
-    path, before = write(tmp_path, top=f"os.chdir('other')\n{then}"), estimators()
-    try:
-        if then:
-            with pytest.raises(fs.InputError, match="late"):
-                load_estimators(path)
-        else:
-            assert list(load_estimators(path).kinds) == ["mine"]
-        assert Path.cwd() == tmp_path
-    finally:
-        restore(before)
+    with refused("late"):
+        load_estimators(write(tmp_path, top="os.chdir('other')\nraise ValueError('late')"))
+    assert Path.cwd() == tmp_path
 
 
 def trial(path: Path, limit_s: float = 60.0) -> EstimatorTrial:
@@ -222,34 +173,20 @@ def test_trial_runs_in_another_process(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("body", "top", "message"),
     [
-        ("os._exit(3)", "", "exit status 3"),
         ("ctypes.string_at(0)", "", "SIGSEGV"),
         (PEAK, "os._exit(0)", "exit status 0"),
-    ],
-)
-def test_what_ends_its_process(tmp_path: Path, body: str, top: str, message: str) -> None:
-    with refused("my_estimator.py", match=message):
-        trial(write(tmp_path, body, top)).elsewhere()
-
-
-@pytest.mark.parametrize(
-    ("body", "top", "message"),
-    [
         ("raise SystemExit(0)", "", "SystemExit: 0"),
-        ("raise KeyboardInterrupt", "", "KeyboardInterrupt"),
         ("return images", "", r"expected shape \(16, 2\), got \(16, 8, 8\)"),
-        ("if images.max() == 0:\n    raise ValueError('dark')\nreturn sensor.zero", "", "ValueError: dark"),
         (PEAK, "raise SystemExit", "SystemExit"),
     ],
 )
-def test_what_is_refused(tmp_path: Path, body: str, top: str, message: str) -> None:
+def test_what_a_trial_refuses(tmp_path: Path, body: str, top: str, message: str) -> None:
+    tried = trial(write(tmp_path, body, top))
+    ends = message == "SIGSEGV" or "exit status" in message
     before = estimators()
-    try:
-        with pytest.raises(fs.InputError, match=message) as caught:
-            trial(write(tmp_path, body, top)).here()
-    finally:
-        restore(before)
-    assert "my_estimator.py" in str(caught.value)
+    with refused("my_estimator.py", match=message):
+        (tried.elsewhere if ends else tried.here)()
+    restore(before)
 
 
 def test_one_that_does_not_let_go_of_the_interpreter(tmp_path: Path) -> None:

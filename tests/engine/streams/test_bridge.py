@@ -4,7 +4,6 @@ import multiprocessing
 import os
 import signal
 import threading
-import time
 from collections.abc import Iterator
 from typing import Any
 
@@ -15,7 +14,6 @@ from tests.patience import wait_for
 from tests.refusals import refused
 
 from faintspot.engine.frames.pixel_ring import PixelRing
-from faintspot.engine.streams import bridge as bridge_module
 from faintspot.engine.streams.bridge import BridgeCounters, StreamBridge
 
 pyshmem = pytest.importorskip("pyshmem")
@@ -52,9 +50,9 @@ class Running:
         self._thread.join()
 
 
-@pytest.fixture(params=[False, True], ids=["parks", "spins"])
+@pytest.fixture
 def running(name: str, request: pytest.FixtureRequest) -> Iterator[Running]:
-    made = Running(name, request.param)
+    made = Running(name, getattr(request, "param", None))
     yield made
     made.end()
     if made.error is not None:
@@ -78,42 +76,26 @@ def stream(name: str, running: Running) -> Iterator[Any]:
     made.unlink()
 
 
-@pytest.mark.parametrize("notify", [False, True])
-@pytest.mark.parametrize("dtype", ["uint16", "int32", "float64"])
+@pytest.mark.parametrize(
+    ("running", "dtype", "notify"),
+    [(False, "uint16", True), (True, "uint16", False), (False, "float64", False)],
+    indirect=["running"],
+)
 def test_frames_of_a_stream_arrive_in_the_ring(name: str, running: Running, dtype: str, notify: bool) -> None:
     running.said("is not there; waiting")
     stream = created(name, dtype, notify=notify)
     running.said("6 x 5 pixels")
     ring = PixelRing.attach(name)
     assert ring.dtype == (np.uint16 if dtype == "uint16" else np.float32)
-    for number in range(20):
-        stream.write(frame(number, dtype))
-        wait_for(lambda number=number: ring.last_row_time_ns(number))
-        np.testing.assert_array_equal(ring.slot(number), frame(number, dtype))
-    assert (running.counters.taken, running.counters.missed, running.counters.not_ahead) == (20, 0, 0)
-    stream.unlink()
-
-
-def test_the_producers_numbers(name: str, running: Running, stream: Any) -> None:
-    ring = PixelRing.attach(name)
-    for number in (0, 1, 2, 7, 2**40, 3):
-        stream.write(frame(number), frame_id=number)
+    for number in (0, 1, 2, 7, 2**40, 3):  # the producer's
+        sent = frame(number, dtype)
+        if dtype == "float64":
+            sent[0, 0], sent[1, 1] = np.nan, 1e300
+        stream.write(sent, frame_id=number)
         wait_for(lambda number=number: ring.progress() == (number, 6))
-        np.testing.assert_array_equal(ring.slot(number), frame(number))
-    assert running.counters.taken == 6
-    assert running.counters.not_ahead == 1
-
-
-def test_nan_passes_and_too_large_is_infinite(name: str, running: Running) -> None:
-    stream = created(name, np.float64)
-    running.said("6 x 5 pixels")
-    sent = frame(0, np.float64)
-    sent[0, 0], sent[1, 1] = np.nan, 1e300
-    stream.write(sent)
-    ring = PixelRing.attach(name)
-    wait_for(lambda: ring.last_row_time_ns(0))
-    assert np.isnan(ring.slot(0)[0, 0])
-    assert np.isinf(ring.slot(0)[1, 1])
+        with np.errstate(over="ignore"):
+            np.testing.assert_array_equal(ring.slot(number), sent.astype(ring.dtype))
+    assert (running.counters.taken, running.counters.missed, running.counters.not_ahead) == (6, 0, 1)
     stream.unlink()
 
 
@@ -163,26 +145,6 @@ def test_a_stream_that_is_made_anew(name: str, running: Running) -> None:
     third.unlink()
 
 
-def test_a_stream_without_frames_is_waited_out(name: str, running: Running) -> None:
-    wrong = pyshmem.create(f"{name}_in", shape=(7,), dtype=np.float32)
-    running.said("expected frames (rows, columns)")
-    wrong.unlink()
-    stream = created(name)
-    running.said("6 x 5 pixels")
-    stream.unlink()
-
-
-def test_silence_is_told_once(running: Running, stream: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(bridge_module, "STALL_S", 0.2)
-    for number in range(2):
-        stream.write(frame(number))
-        wait_for(lambda number=number: running.counters.stalls == number + 1)
-    running.said("resumed")
-    time.sleep(0.5)
-    assert running.counters.stalls == 2
-    running.said(f"pid {os.getpid()}, which made it, is alive")
-
-
 def _die_while_writing(name: str, ready: Any) -> None:
     stream = pyshmem.create(f"{name}_in", shape=SHAPE, dtype=np.uint16)
     ready.wait()
@@ -221,12 +183,3 @@ def test_the_ring_belongs_to_somebody_else(name: str) -> None:
     stream.unlink()
     with refused("n_frames = 0"):
         StreamBridge(f"{name}_in", name).run(0)
-
-
-def test_idle_leaves_the_processor_alone(running: Running, stream: Any) -> None:
-    """Without frames less than half of a processor is used: a loop without pauses would use one."""
-    stream.write(frame(0))
-    time.sleep(0.2)
-    start, processor = time.monotonic(), time.process_time()
-    time.sleep(1.0)
-    assert time.process_time() - processor < 0.5 * (time.monotonic() - start)

@@ -1,24 +1,22 @@
 """The recorder: what the engine wrote is in the store, whatever ends the recording."""
 
 import multiprocessing
-import time
+import resource
 from collections.abc import Iterator
 from multiprocessing.synchronize import Event
 from pathlib import Path
-from typing import Any
 
-import numpy as np
 import pytest
 from tests.refusals import refused
 
 pytest.importorskip("zarr")
 
-from tests.engine.commands import needs_shared_memory, process
+from tests.engine.commands import needs_shared_memory, process, start
 from tests.engine.telemetry_cases import LAYOUT, SETTINGS, Engine, as_written, write
 from tests.patience import wait_for
 
 from faintspot.engine.telemetry import recorder
-from faintspot.engine.telemetry.recorder import Recorder, TelemetryStore
+from faintspot.engine.telemetry.recorder import Recorder
 from faintspot.engine.telemetry.ring import TelemetryRing
 from faintspot.io import read_telemetry
 
@@ -42,57 +40,20 @@ def record_on(name: str, path: Path, started: Event) -> None:
 
 
 @with_threads
-def test_a_number_of_frames(engine: Engine, name: str, tmp_path: Path) -> None:
+def test_no_space_is_one_line(engine: Engine, name: str, tmp_path: Path) -> None:
+    """Files may not be larger than 60 kB: what was written before is whole."""
+    code = "from faintspot.cli import main; main()"
     path = tmp_path / "night.zarr"
-    seen: list[int] = []
-    report = Recorder(name, path).run(n_frames=150, progress=seen.append)
-    assert (report.frames, report.ended_because) == (150, "frames")
-    assert report.dropped + report.dropped_images + report.dropped_changes == 0
-    assert seen[-1] == 150
+    limit = lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (60_000, 60_000))  # noqa: E731
+    process = start(code, "realtime", "record", str(path), "--name", name, preexec_fn=limit)
+    _, said = process.communicate(timeout=PATIENCE_S)
+    assert process.returncode == 2, said
     telemetry = read_telemetry(path)
+    assert len(telemetry.frame) > 0
     assert as_written(vars(telemetry))
-    assert list(np.diff(telemetry.frame)) == [1] * 149
-    assert report.images == len(telemetry.image_frame) >= 10
-    assert np.all(telemetry.raw == telemetry.image_frame[:, None, None])
-    assert np.all(telemetry.denoised == telemetry.image_frame[:, None, None, None] + 0.5)
-    assert [change["number"] for change in telemetry.changes] == list(range(report.changes))
-    attributes = telemetry.attributes
-    assert (attributes["complete"], attributes["ended_because"]) == (True, "frames")
-    assert type(LAYOUT)(**attributes["layout"]) == LAYOUT
-    assert attributes["settings"] == SETTINGS
-
-
-@with_threads
-def test_recorder_ends_after_its_time(
-    engine: Engine, name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Written in many parts."""
-    monkeypatch.setattr(recorder, "_FLUSH_S", 0.02)
-    report = Recorder(name, tmp_path / "night.zarr").run(seconds=0.5)
-    assert report.ended_because == "seconds"
-    telemetry = read_telemetry(tmp_path / "night.zarr")
-    assert len(telemetry.frame) == report.frames > 0
-    assert as_written(vars(telemetry))
-
-
-@with_threads
-def test_a_slow_disk_loses_only_records(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    append = TelemetryStore.append
-
-    def slow(*arguments: Any) -> None:
-        time.sleep(0.2)
-        append(*arguments)
-
-    monkeypatch.setattr(TelemetryStore, "append", slow)
-    monkeypatch.setattr(recorder, "_FLUSH_S", 0.01)
-    with Engine(TelemetryRing.create(name, LAYOUT, records=16), pause_s=2e-4):
-        report = Recorder(name, tmp_path / "night.zarr").run(n_frames=100)
-    assert report.dropped > 0
-    assert report.longest_write_s >= 0.2
-    telemetry = read_telemetry(tmp_path / "night.zarr")
-    assert as_written(vars(telemetry))
-    absent = telemetry.frame[-1] - telemetry.frame[0] + 1 - report.frames
-    assert 0 < absent <= report.dropped == telemetry.attributes["dropped_records"]
+    assert "cannot be written: File too large" in said
+    assert said.rstrip().endswith(f"; {len(telemetry.frame)} frames are in the store")
+    assert said.count("error") == 1
 
 
 @with_threads
@@ -124,10 +85,15 @@ def test_a_recording_needs_an_engine_a_new_store_and_limits_above_zero(name: str
                 Recorder(name, tmp_path / f"{next(iter(wrong))}.zarr").run(**wrong)
 
 
-def test_methods_that_came_later_are_named(name: str, tmp_path: Path) -> None:
-    with TelemetryRing.create(name, LAYOUT, methods=["none", "tv"]) as ring:
+def test_what_a_recording_says_of_its_engine(name: str, tmp_path: Path) -> None:
+    with TelemetryRing.create(name, LAYOUT, settings=SETTINGS, methods=["none", "tv"]) as ring:
         recording = Recorder(name, tmp_path / "night.zarr")
         write(ring, 1)
         ring.write_change(2, 1, {"methods": ["ml", "set"], "first_method": 2, "every": 50}, None)
         recording.run(n_frames=1)
-    assert read_telemetry(tmp_path / "night.zarr").attributes["methods"] == ["none", "tv", "ml", "set"]
+        later = Recorder(name, tmp_path / "later.zarr")
+        assert later.run(seconds=1e-3).ended_because == "seconds"
+    attributes = read_telemetry(tmp_path / "night.zarr").attributes
+    assert attributes["methods"] == ["none", "tv", "ml", "set"]
+    assert attributes["settings"] == SETTINGS
+    assert type(LAYOUT)(**attributes["layout"]) == LAYOUT

@@ -4,6 +4,7 @@ import multiprocessing
 import time
 from multiprocessing.synchronize import Event
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -47,33 +48,33 @@ def test_commands_and_the_loops_state(name: str) -> None:
 
 def test_what_is_written_is_read(name: str) -> None:
     before = time.time_ns() - time.monotonic_ns()
-    with TelemetryRing.create(
-        name, LAYOUT, settings=SETTINGS, methods=["none", "tv"], records=16, image_slots=3
-    ) as ring:
+    options: dict[str, Any] = {
+        "settings": SETTINGS,
+        "methods": ["none", "tv"],
+        "records": 16,
+        "image_slots": 3,
+    }
+    with TelemetryRing.create(name, LAYOUT, **options) as ring:
         reader = TelemetryRing.attach(name)
         assert reader.layout == LAYOUT
         assert reader.description["settings"] == SETTINGS
         assert reader.description["methods"] == ["none", "tv"]
-        records, cursor, dropped = reader.records.since(0)
-        assert (len(records), cursor, dropped) == (0, 0, 0)
-        for frame in range(5):
+        slopes = slopes_of(0)
+        ring.write(0, 0, 0, (7, 507), slopes)
+        slopes.x[:] = -1  # what was written stays
+        for frame in range(1, 5):
             write(ring, frame)
         records, cursor, dropped = reader.records.since(0)
         assert (len(records), cursor, dropped, reader.records.written) == (5, 5, 0, 5)
         assert as_written(records)
-        assert list(records["sequence"]) == [0, 1, 2, 3, 4]
         # The wall clock may be corrected by some milliseconds meanwhile.
         assert np.all(np.abs(records["clock_offset_ns"] - before) < 1e9)
-        assert reader.records.since(cursor)[0].shape == (0,)
         some, cursor, _ = reader.records.since(1, most=2)
         assert list(some["frame"]) == [1, 2]
         assert cursor == 3
         write_images(ring, 4)
         images, image_cursor, dropped = reader.images.since(0)
         assert (image_cursor, dropped, reader.images.written) == (1, 0, 1)
-        assert images["image_frame"][0] == 4
-        assert np.all(images["raw"] == 4)
-        assert np.all(images["denoised"] == 4.5)
         assert images["denoised"].shape == (1, N, 8, 8)
         assert not is_stale(reader)
     assert is_stale(reader)
@@ -81,32 +82,6 @@ def test_what_is_written_is_read(name: str) -> None:
     reader.close()
     with refused("start the engine first"):
         TelemetryRing.attach(name)
-
-
-def test_records_of_a_frame_are_copies(name: str) -> None:
-    with TelemetryRing.create(name, LAYOUT, records=4) as ring:
-        reader, slopes = TelemetryRing.attach(name), slopes_of(0)
-        ring.write(0, 0, 0, (7, 507), slopes)
-        slopes.x[:] = -1
-        kept = reader.records.since(0)[0]
-        for frame in range(1, 9):
-            write(ring, frame)
-        assert as_written(kept)
-
-
-def test_what_is_overwritten_is_counted(name: str) -> None:
-    with TelemetryRing.create(name, LAYOUT, records=8, image_slots=2) as ring:
-        reader = TelemetryRing.attach(name)
-        for frame in range(20):
-            write(ring, frame)
-            write_images(ring, frame)
-        records, cursor, dropped = reader.records.since(3)
-        # Of 8 places one may be being written to.
-        assert list(records["frame"]) == list(range(13, 20))
-        assert (cursor, dropped) == (20, 10)
-        images, cursor, dropped = reader.images.since(0)
-        assert list(images["image_frame"]) == [19]
-        assert (cursor, dropped) == (20, 19)
 
 
 def test_memory_is_bounded(name: str) -> None:
@@ -133,11 +108,6 @@ def test_changes_are_read_with_their_frames(name: str) -> None:
         assert (second["frame"], second["number"]) == (13, 2)
         assert second["changes"] == {"noise_std": "too long"}
         assert second["too_long_bytes"] > 4096
-        for number in range(3, 303):
-            ring.write_change(20, number, {"noise_std": 1.0}, None)
-        changes, cursor, dropped = reader.changes_since(2)
-        assert [change["number"] for change in changes] == list(range(48, 303))  # the last 255 of 256 places
-        assert (cursor, dropped) == (302, 45)
 
 
 def test_nothing_is_torn_between_processes(name: str) -> None:
