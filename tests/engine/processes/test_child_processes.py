@@ -1,20 +1,27 @@
-"""Processes that end with the one that has started them."""
+"""Processes that end with the one that has started them; which live, and how they are scheduled."""
 
+import os
 import signal
+import subprocess
+import sys
+import threading
+import time
 from pathlib import Path
 from uuid import uuid4
 
 import pytest
 from tests.engine.commands import start
 from tests.patience import LIMIT_S, wait_for
-from tests.refusals import refused
 
 from faintspot.base.errors import InputError
-from faintspot.engine.processes.child_processes import ChildProcesses
+from faintspot.engine.processes.child_processes import ChildProcesses, real_time
+from faintspot.engine.processes.segment import process_age_s, process_lives, process_start
 
 pytest.importorskip("pyshmem")
 
+
 pytestmark = pytest.mark.slow
+
 # A bridge waits for a stream that never comes.
 PARENT = """
 import sys, time
@@ -59,7 +66,7 @@ def test_one_that_ends_says_why_and_all_others_end(tmp_path: Path) -> None:
         with pytest.raises(InputError, match=r"run: the process has ended: .*nothing\.toml: no such file"):
             processes.wait_until(lambda: False, "run", LIMIT_S)
         bridge = processes._started["bridge"]
-    assert bridge.returncode is not None
+    assert bridge.returncode == 0
     assert not processes._started
     assert (tmp_path / "bridge.log").stat().st_mode & 0o077 == 0
 
@@ -85,6 +92,43 @@ def test_one_that_does_not_end_is_killed(tmp_path: Path, monkeypatch: pytest.Mon
     assert process.returncode == -signal.SIGKILL
 
 
-def test_a_folder_that_is_none(tmp_path: Path) -> None:
-    with refused("cannot be written"):
-        ChildProcesses(tmp_path / "none").start("run", ["realtime", "run"])
+def test_which_processes_live_and_how_old_they_are() -> None:
+    """To the clock tick, 10 ms, in which starts are counted."""
+    mine = process_start(os.getpid())
+    assert process_lives(os.getpid(), mine)
+    assert not process_lives(os.getpid(), mine + 1)  # the number was used again
+    begin = time.monotonic()
+    with subprocess.Popen(["sleep", "60"]) as process:
+        time.sleep(0.1)
+        age = process_age_s(process.pid)
+        assert 0.1 - 0.02 <= age <= time.monotonic() - begin + 0.02
+        process.kill()
+    assert process_start(process.pid) == process_age_s(process.pid) == -1
+    assert not process_lives(process.pid, -1)
+
+
+def test_priority_holds_for_threads_that_were_there_before_and_is_given_back() -> None:
+    done = threading.Event()
+    thread = threading.Thread(target=done.wait)
+    thread.start()
+    assert thread.native_id is not None
+    threads = 0, thread.native_id
+    before = [os.sched_getscheduler(each) for each in threads]
+    try:
+        with real_time(priority=1) as refused:
+            if any("priority" in line for line in refused):
+                pytest.skip("real-time priority is not permitted")
+            assert [os.sched_getscheduler(each) for each in threads] == [os.SCHED_FIFO] * 2
+        assert [os.sched_getscheduler(each) for each in threads] == before
+    finally:
+        done.set()
+        thread.join()
+
+
+def test_the_lowest_priority() -> None:
+    code = (
+        "import os; from faintspot.engine.processes.child_processes import low_priority; low_priority();"
+        "print(os.sched_getscheduler(0) == os.SCHED_BATCH, os.nice(0))"
+    )
+    shown = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert shown.stdout.split() == ["True", "19"]

@@ -23,7 +23,6 @@ from tests.refusals import refused
 from faintspot.base.errors import InputError
 from faintspot.engine.processes import requests as control
 from faintspot.engine.processes.requests import LARGEST_REQUEST, ControlServer, request, socket_path
-from faintspot.engine.request_handlers import while_starting
 
 pytestmark = pytest.mark.slow
 
@@ -114,27 +113,13 @@ def test_errors_come_back_in_one_line(server: ControlServer, command: str, named
     assert is_well(server.path)
 
 
-def test_an_engine_that_starts_refuses_until_it_is_there(path: Path) -> None:
-    handlers = while_starting()
-    with ControlServer(path, handlers):
-        with refused():
-            request(path, "status")
-        handlers["status"] = lambda fields: {"state": "there"}
-        assert request(path, "status")["state"] == "there"
-
-
 def test_a_large_reply_arrives_whole_and_a_huge_one_is_refused(server: ControlServer) -> None:
     assert len(request(server.path, "large", length=3_000_000, timeout_s=30)["text"]) == 3_000_000
     with refused("reply"):
         request(server.path, "large", length=17_000_000, timeout_s=30)
-
-
-def test_a_request_in_small_pieces(server: ControlServer) -> None:
-    with connected(server.path) as connection:
-        for byte in b'{"command": "add", "a": 1, "b": 1}\n':
-            connection.sendall(bytes([byte]))
-            assert byte != ord("b") or is_well(server.path)
-        assert json.loads(connection.recv(1000)) == {"ok": True, "sum": 2}
+    for value in (object(), float("nan")):
+        with refused("JSON"):  # before it is sent
+            request(server.path, "add", value=value)
 
 
 def test_others_are_answered_while_a_lengthy_command_lasts(path: Path) -> None:
@@ -166,18 +151,21 @@ def test_others_are_answered_while_a_lengthy_command_lasts(path: Path) -> None:
     assert most == [1]
 
 
-@pytest.mark.parametrize("kind", [SystemExit, KeyboardInterrupt, GeneratorExit])
 @pytest.mark.parametrize("lengthy", [[], ["leave"]])
-def test_an_exit_in_a_command_is_an_error_of_that_command(
-    path: Path, kind: type[BaseException], lengthy: list[str]
-) -> None:
+def test_an_exit_in_a_command_is_an_error_of_that_command(path: Path, lengthy: list[str]) -> None:
     def leave(fields: dict[str, Any]) -> dict[str, Any]:
-        raise kind("for good")
+        raise SystemExit("for good")
 
-    with ControlServer(path, {**HANDLERS, "leave": leave}, lengthy=lengthy):
-        with pytest.raises(InputError, match=f"{kind.__name__}: for good"):
+    def stop(fields: dict[str, Any]) -> dict[str, Any]:
+        living.close()
+        return {"stopped": True}
+
+    with ControlServer(path, {**HANDLERS, "leave": leave, "stop": stop}, lengthy=lengthy) as living:
+        with refused("SystemExit: for good"):
             request(path, "leave", timeout_s=30)
         assert is_well(path)
+        assert request(path, "stop") == {"stopped": True}
+    assert not path.exists()
 
 
 def test_connections_leave_nothing_for_the_garbage_collector(server: ControlServer) -> None:
@@ -227,8 +215,7 @@ def test_garbage_never_stops_the_server(
     assert is_well(server.path)
 
 
-@pytest.mark.parametrize("end", [b"", b"\n"])
-@pytest.mark.parametrize("size", [LARGEST_REQUEST, 5_000_000])
+@pytest.mark.parametrize(("size", "end"), [(LARGEST_REQUEST, b""), (5_000_000, b"\n")])
 def test_a_huge_message_is_refused_and_its_sender_disconnected(
     server: ControlServer, size: int, end: bytes
 ) -> None:
@@ -249,41 +236,13 @@ def test_the_largest_request_is_answered(server: ControlServer) -> None:
         request(server.path, "echo", text=text + "x")
 
 
-def test_clients_that_hang_hold_up_nobody(server: ControlServer) -> None:
-    with contextlib.ExitStack() as stack:
-        for number in range(60):
-            connection = stack.enter_context(connected(server.path))
-            if number % 3 == 0:
-                connection.sendall(b'{"command": "ad')
-            elif number % 3 == 1:  # never reads its reply
-                connection.sendall(b'{"command": "large", "length": 1000000}\n')
-            assert number % 10 or is_well(server.path)
-        assert is_well(server.path)
-    assert is_well(server.path)
-
-
 def test_a_client_that_hangs_is_disconnected(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(control, "_IDLE_S", 0.1)
     with ControlServer(path, HANDLERS), connected(path) as connection:
         connection.sendall(b'{"command": "ad')
+        assert is_well(path)
         assert replies(connection) == []
         assert is_well(path)
-
-
-def test_many_clients_at_once(server: ControlServer) -> None:
-    found: dict[tuple[int, int], int] = {}
-
-    def ask(client: int) -> None:
-        for number in range(25):
-            reply = request(server.path, "add", a=1000 * client, b=number, timeout_s=60)
-            found[client, number] = reply["sum"]
-
-    clients = [threading.Thread(target=ask, args=(client,)) for client in range(16)]
-    for thread in clients:
-        thread.start()
-    for thread in clients:
-        thread.join()
-    assert found == {(i, j): 1000 * i + j for i in range(16) for j in range(25)}
 
 
 # Who may ask
@@ -294,6 +253,8 @@ def test_only_the_user_can_open_the_socket(server: ControlServer) -> None:
     assert stat.S_ISSOCK(status.st_mode)
     assert stat.S_IMODE(status.st_mode) == 0o600
     assert stat.S_IMODE(Path(f"{server.path}.lock").stat().st_mode) == 0o600
+    with refused("lab"):  # a living one is not replaced
+        ControlServer(server.path, {})
 
 
 STRANGER = """
@@ -309,29 +270,29 @@ except InputError as error:
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root can act as another user")
-@pytest.mark.parametrize("door_is_open", [False, True])
-def test_another_user_is_told_no(server: ControlServer, door_is_open: bool) -> None:
-    if door_is_open:
-        server.path.parent.chmod(0o755)
-        server.path.chmod(0o666)
+def test_another_user_is_told_no(server: ControlServer) -> None:
+    server.path.parent.chmod(0o755)
+    server.path.chmod(0o666)
     said, _ = start(STRANGER, str(server.path)).communicate(timeout=60)
     assert said.splitlines() == ["the engine lab belongs to another user"]
     assert is_well(server.path)
 
 
-def test_a_folder_that_others_may_write_to_is_refused(path: Path) -> None:
+def test_places_for_a_socket(path: Path) -> None:
+    for place in ("none/deeper/faintspot-a.sock", "x" * 120):
+        with refused():
+            ControlServer(path.parent / place, HANDLERS)
+    path.write_text("mine")  # something else stays
+    with refused(str(path)):
+        ControlServer(path, HANDLERS)
+    assert path.read_text() == "mine"
+    path.unlink()
     path.parent.chmod(0o777)
     with refused(str(path.parent)):
         ControlServer(path, HANDLERS)
 
 
 # Life and death
-
-
-def test_a_living_server_is_not_replaced(server: ControlServer) -> None:
-    with refused("lab"):
-        ControlServer(server.path, {})
-    assert is_well(server.path)
 
 
 VICTIM = """
@@ -380,7 +341,7 @@ def test_of_many_that_start_at_once_one_lives(path: Path) -> None:
         except InputError as error:
             refused.append(str(error))
 
-    for _ in range(20):
+    for _ in range(10):
         starters = [threading.Thread(target=serve) for _ in range(8)]
         for thread in starters:
             thread.start()
@@ -392,31 +353,6 @@ def test_of_many_that_start_at_once_one_lives(path: Path) -> None:
         refused.clear()
 
 
-def test_a_command_may_close_the_server(path: Path) -> None:
-    def stop(fields: dict[str, Any]) -> dict[str, Any]:
-        living.close()
-        return {"stopped": True}
-
-    living = ControlServer(path, {"stop": stop})
-    assert request(path, "stop") == {"stopped": True}
-    living.close()
-    assert not path.exists()
-
-
-def test_something_else_in_the_sockets_place_stays(path: Path) -> None:
-    path.write_text("mine")
-    with refused(str(path)):
-        ControlServer(path, HANDLERS)
-    assert path.read_text() == "mine"
-
-
-@pytest.mark.parametrize("place", ["none/faintspot-a.sock", "x" * 120])
-def test_a_place_that_cannot_be_is_refused(path: Path, place: str) -> None:
-    folder = path.parent if place.startswith("x") else path.parent / "deeper"
-    with pytest.raises(InputError):
-        ControlServer(folder / place, HANDLERS)
-
-
 # The client
 
 
@@ -425,7 +361,6 @@ def test_a_place_that_cannot_be_is_refused(path: Path, place: str) -> None:
     [
         (b"", "ended before it answered"),
         (b'{"ok": tr', "ended before"),
-        (b"[]\n", "not valid"),
         (b"\xff\n", "not valid"),
         (None, "does not answer: waited 0.2 s"),
     ],
@@ -450,12 +385,6 @@ def test_an_engine_that_misbehaves(path: Path, reply: bytes | None, named: str) 
             request(path, "status", timeout_s=0.2 if reply is None else 30)
         released.set()
         thread.join()
-
-
-def test_what_json_cannot_hold_is_refused_before_it_is_sent(path: Path) -> None:
-    for value in (object(), float("nan")):
-        with refused("JSON"):
-            request(path, "status", value=value)
 
 
 def test_the_usual_place_is_private(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

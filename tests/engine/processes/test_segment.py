@@ -24,7 +24,7 @@ def refused(name: str, *texts: str) -> None:
             action(name)
 
 
-@pytest.mark.parametrize("raw", [b"", b"short", b"x" * 4096, b"faintspt", b"\0" * 100])
+@pytest.mark.parametrize("raw", [b"", b"x" * 4096, b"faintspt"])
 def test_what_is_not_a_ring_is_refused(name: str, raw: bytes) -> None:
     path = FOLDER / name
     path.write_bytes(raw)
@@ -73,9 +73,7 @@ def test_unknown_and_bad_names_are_refused(name: str) -> None:
     [
         ((0, 4), "f4", 4, "shape = 0"),
         ((4, 4, 4), "f4", 4, "shape: expected"),
-        ((2.5, 4), "f4", 4, "shape = 2.5"),
         ((4, 4), "c8", 4, "dtype = <c8"),
-        ((4, 4), ">u2", 4, "dtype = >u2"),
         ((4, 4), "f4", 1, "slots = 1"),
         ((65536, 65536), "f8", 100, "expected at most 64 GiB"),
     ],
