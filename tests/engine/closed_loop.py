@@ -6,6 +6,8 @@ commands are waited for. So those computed from frame k act in frame k + 2, howe
 
 import threading
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +18,7 @@ from tests.loop.simulation.loop_cases import faint
 from tests.patience import wait_for
 
 import faintspot as fs
+from faintspot.base.files import Closing
 from faintspot.engine.control.control_loop import ControlLoop
 from faintspot.engine.engine import Engine
 from faintspot.engine.processes.segment import FOLDER
@@ -79,7 +82,7 @@ class RunningEngine:
         assert not self._thread.is_alive()
 
 
-class Sky:
+class Sky(Closing):
     """The telescope, and the engines that follow it."""
 
     def __init__(self, name: str, configuration: Any = CONFIGURATION, **options: Any) -> None:
@@ -103,7 +106,24 @@ class Sky:
         self.telescope.run(1)
         if counters is not None:
             self.until(lambda: counters.frames_in > before)
+        return self.truth
+
+    @property
+    def truth(self) -> dict[str, float]:
+        """Of the last frame."""
         return dict(zip(TRUTH, self._truth.read().tolist(), strict=True))
+
+    @contextmanager
+    def observing(self) -> Iterator[None]:
+        """Let frames come in another thread."""
+        stop = threading.Event()
+        runner = threading.Thread(target=self.telescope.run, args=(None, stop))
+        runner.start()
+        try:
+            yield
+        finally:
+            stop.set()
+            runner.join()
 
     @property
     def pixels(self) -> np.ndarray:

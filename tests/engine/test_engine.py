@@ -1,33 +1,35 @@
 """The engine between a pixel ring and its streams: every frame once and bit for bit."""
 
-import io
 import os
+import signal
 import subprocess
 import sys
 import threading
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 from uuid import uuid4
 
 import numpy as np
 import pytest
-from rich.console import Console
+from click.testing import CliRunner
 from tests.engine.bench import SETTINGS, Bench, make, simulated
-from tests.patience import LIMIT_S
+from tests.patience import LIMIT_S, wait_for
 from tests.refusals import refused
 
 import faintspot as fs
-from faintspot.cli.realtime import control as realtime_control
+from faintspot.cli.realtime import command
 from faintspot.engine.engine import Engine
-from faintspot.engine.frames.readout import Replay
+from faintspot.engine.frames.pixel_ring import PixelRing
 from faintspot.engine.frames.workers import PipelineMaker
+from faintspot.engine.processes.requests import request, socket_path
 from faintspot.engine.processes.segment import FOLDER
 from faintspot.engine.request_handlers import commands_of
 from faintspot.engine.streams.bridge import StreamBridge
-from faintspot.io import open_frames
 from faintspot.slopes.pipeline import configuration
 
 pyshmem = pytest.importorskip("pyshmem")
+
 
 pytestmark = pytest.mark.slow
 
@@ -102,61 +104,21 @@ def test_frames_of_a_ring_that_was_waited_for_count(bench: Bench, monkeypatch: p
 
 
 def test_frames_of_a_stream() -> None:
-    """The engine follows a pyshmem stream itself, also when it comes back with another size."""
+    """The engine follows a pyshmem stream itself, also when it comes back."""
     data = simulated(4)
     expected = make(SETTINGS)(data).vector
     name = f"fs_test_{uuid4().hex[:12]}"
     with Bench(f"{name}_ring", source=StreamBridge(name, f"{name}_ring")) as bench:
-        for shape in (data.shape[1:], (64, 64), data.shape[1:]):
-            stream = pyshmem.create(name, shape=shape, dtype=np.uint16)
-            if shape != data.shape[1:]:
-                bench.until(lambda: bench.engine.status()["source_refused"] is not None)
-            else:
-                sent = bench.engine.counters.processed
-                for number in (1, 2, 3):
-                    while bench.engine.counters.processed == sent:  # the first ones come before it looks
-                        stream.write(data[number], frame_id=number)
-                        bench.until(lambda: True)
-                    sent = bench.engine.counters.processed
+        for _ in range(2):
+            stream, sent = pyshmem.create(name, shape=data.shape[1:], dtype=np.uint16), bench.engine.counters
+            for number in (1, 2, 3):
+                before = sent.processed
+                while sent.processed == before:  # the first ones come before it looks
+                    stream.write(data[number], frame_id=number)
             stream.close()
             pyshmem.unlink(name)
         assert bench.engine.counters.processed >= 6
         assert np.array_equal(bench.slopes[3], expected[3])
-
-
-def test_recorded_frames_give_the_slopes_that_they_give_offline(bench: Bench, tmp_path: Path) -> None:
-    """Replayed row by row, much faster than it measures: every frame, as the pipeline measures it."""
-    data = simulated(20)
-    data[5:10, 8:16, 8:16] = np.roll(data[5:10, 8:16, 8:16], 3, axis=2)  # a spot off its place
-    np.save(tmp_path / "frames.npy", data)
-    with (
-        open_frames([tmp_path / "frames.npy"]) as source,
-        bench.ring() as ring,
-        Replay(source, ring, frame_rate_hz=1e5, rows_per_block=5, waits=True) as player,
-    ):
-        assert (player.run().frames, player.lost) == (20, 0)
-    bench.detached()
-    expected, records = make(SETTINGS)(data), bench.records
-    assert expected.flags[5, 5] & fs.SubapertureFlag.UNLIKE_NEIGHBOURS
-    assert records["frame"].tolist() == list(range(20))
-    for record in records:
-        for name in ("x", "y", "flux", "flags", "iterations", "standard_error_x"):
-            assert np.array_equal(record[name], getattr(expected, name)[record["frame"]]), name
-
-
-def test_the_terminal_shows_the_status(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
-    data = simulated(1)
-    with bench.ring() as ring:
-        bench.attached()
-        bench.send(ring, 0, data[0])
-        monkeypatch.setattr(realtime_control, "asked", lambda name, what: bench.engine.status())
-        console = Console(width=100, record=True, file=io.StringIO())
-        console.print(realtime_control._table(bench.name))
-    text = console.export_text()
-    mean = make(SETTINGS)(data[0]).iterations.mean()
-    assert f"{mean:.1f}" in next(line for line in text.splitlines() if "iterations a sub-aperture" in line)
-    assert "latency p99.9, us" in text
-    assert f"process {os.getpid()}, frame 0" in text
 
 
 def test_new_spots_are_measured_with_from_the_next_frame(bench: Bench, tmp_path: Path) -> None:
@@ -285,3 +247,98 @@ def test_settings_of_each_subaperture_change_while_frames_come(bench: Bench) -> 
         settings = SETTINGS.replace(**proposed[record["change"]])
         expected = make(settings)(data[record["frame"] % 8]).vector
         np.testing.assert_array_equal(np.concatenate([record["x"], record["y"]]), expected)
+
+
+CONFIGURATION = """
+[layout.grid]
+shape = [4, 4]
+pixels = 8
+
+[estimator]
+name = "tv"
+noise_std = 1.0
+keep_brightest = 9
+
+[calibration]
+dark = 100.0
+read_noise_e = 1.0
+"""
+COMMAND = [sys.executable, "-m", "faintspot", "realtime"]
+
+
+@pytest.fixture
+def processes(name: str, tmp_path: Path) -> Iterator[list[subprocess.Popen[bytes]]]:
+    """Start an engine and recorded frames in place of a camera; end them."""
+    (tmp_path / "faintspot.toml").write_text(CONFIGURATION)
+    frames = np.random.default_rng(3).poisson(103.0, (50, 32, 32)).astype(np.uint16)
+    np.save(tmp_path / "frames.npy", frames)
+    camera = f"replay frames.npy --name {name} --frame-rate-hz 200 --repeat".split()
+    environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}
+    started = []
+    for arguments in (["run", "--name", name], camera):
+        with (tmp_path / f"{arguments[0]}.log").open("w") as log:
+            started.append(
+                subprocess.Popen([*COMMAND, *arguments], cwd=tmp_path, env=environment, stdout=log)
+            )
+    yield started
+    for process in started:
+        process.send_signal(signal.SIGINT)  # so that it removes its shared memory; nothing where it has ended
+        try:
+            process.wait(LIMIT_S)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
+
+
+def counted(name: str) -> int:
+    """Return how many frames the engine has measured; 0 while it starts and refuses to answer."""
+    try:
+        return int(request(socket_path(name), "status")["counters"]["processed"])
+    except fs.InputError:
+        return 0
+
+
+def captured(name: str, count: int) -> dict[int, tuple[np.ndarray, np.ndarray]]:
+    """Frames and slopes of the same number, as another process sees them."""
+    stream, ring = pyshmem.open(f"{name}_slopes"), PixelRing.attach(name)
+    found: dict[int, tuple[np.ndarray, np.ndarray]] = {}
+
+    def enough() -> bool:
+        if stream.count:
+            publication = stream.read_publication()
+            number = publication.frame_id
+            frame = ring.slot(number).copy()
+            if ring.intact(number):
+                found[number] = frame, np.array(publication.payload)
+        return len(found) >= count
+
+    wait_for(enough, "slopes")
+    stream.close()
+    return found
+
+
+def test_camera_engine_and_client_work_as_processes(
+    name: str, processes: list[subprocess.Popen[bytes]], tmp_path: Path
+) -> None:
+    wait_for(lambda: socket_path(name).exists(), "the engine")
+    wait_for(lambda: counted(name) > 10, "frames")
+    pipeline = fs.SlopePipeline.from_file(tmp_path / "faintspot.toml")
+    for frame, slopes in captured(name, 30).values():
+        assert np.array_equal(slopes, pipeline(frame).vector)
+
+    said = CliRunner().invoke(command, ["send", "noise_std=2.5", "keep_brightest=5", "--name", name])
+    assert "in effect from frame" in said.output
+    changed = fs.SlopePipeline(
+        pipeline.layout, pipeline.settings.replace(noise_std=2.5, keep_brightest=5), pipeline.calibration
+    )
+    for frame, slopes in captured(name, 30).values():
+        assert np.array_equal(slopes, changed(frame).vector)
+
+    engine, camera = processes
+    camera.send_signal(signal.SIGTERM)
+    assert camera.wait(LIMIT_S) == 0
+    assert not (FOLDER / name).exists()
+    CliRunner().invoke(command, ["stop", "--name", name])
+    assert engine.wait(LIMIT_S) == 0
+    assert "frames measured" in (tmp_path / "run.log").read_text()
+    assert not socket_path(name).exists()

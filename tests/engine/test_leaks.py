@@ -24,7 +24,7 @@ from faintspot.engine.settings.estimators import EstimatorTrial
 pytestmark = pytest.mark.slow
 
 TIMES = int(os.environ.get("FAINTSPOT_LEAK_TIMES", "1"))
-FEW = max(50, 20 * TIMES)
+FEW = 20 * TIMES
 FIRST = 12  # changes before the count begins: everything is compiled, and the heap has its size
 
 
