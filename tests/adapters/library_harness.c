@@ -1,5 +1,5 @@
-/* Measure frames, count allocations while they are measured, and open bundles that are damaged: for sanitizers
- * and valgrind. Usage: library_harness BUNDLE PIXELS FRAMES TRIALS; linked with --wrap for the allocations. */
+/* Measure frames, count allocations while they are measured, and open bundles that are damaged: for sanitizers.
+ * Usage: library_harness BUNDLE PIXELS FRAMES TRIALS; linked with --wrap for the allocations. */
 #include <stdint.h>
 #include <stdio.h>
 #include <stdlib.h>

@@ -6,7 +6,7 @@ import pytest
 from tests.refusals import refused
 
 import faintspot as fs
-from faintspot import InputError, Settings
+from faintspot import Settings
 from faintspot.base.flags import INVALID
 
 pytestmark = pytest.mark.slow  # the import of HCIPy, in every process
@@ -66,10 +66,9 @@ def optics() -> Any:
     return sensor()
 
 
-@pytest.mark.parametrize("shift_px", [0.0, 0.3, -0.45])
-def test_noise_free_slopes_are_hcipys_own(shift_px: float) -> None:
+def test_noise_free_slopes_are_hcipys_own() -> None:
     # The same pixels are summed: float32 pixels against float64 leave 1e-6 px.
-    moved = sensor(shift_px=shift_px)
+    moved = sensor(shift_px=0.3)
     image, mask = image_through(moved), inner(moved)
     expected = theirs(moved, image, mask)
     slopes = SlopeEstimator(moved.mla_grid, moved.mla_index, mask, settings=EVERYTHING).estimate([image])
@@ -114,13 +113,21 @@ def test_fits_into_hcipys_sensor_and_takes_what_it_takes(optics: Any) -> None:
     whole = WavefrontSensor(wfs_estimator=chosen, detector=hcipy.NoiselessDetector(image.grid))
     whole.detector.integrate(image, 1)
     np.testing.assert_array_equal(whole.read_out(), chosen.estimate([image]))
+    other = hcipy.Field(np.asarray(image), hcipy.make_pupil_grid(84, 1.0))
+    for images, message in (
+        (image, "list of one image"),
+        ([], "list of one image"),
+        ([image[:-1]], "list of one image"),
+        ([other], "another grid"),
+    ):
+        with refused(message):
+            first.estimate(images)
 
 
 def test_lenslets_beside_the_detector_are_left_out() -> None:
     grid = hcipy.make_pupil_grid(84, WIDTH_M)
-    square = hcipy.SquareShackHartmannWavefrontSensorOptics(
-        grid, F_NUMBER, LENSLETS, WIDTH_M
-    )  # to twice the pupil
+    optics = hcipy.SquareShackHartmannWavefrontSensorOptics
+    square = optics(grid, F_NUMBER, LENSLETS, WIDTH_M)  # to twice the pupil
     estimator = SlopeEstimator(square.mla_grid, square.mla_index, settings=FAINT)
     own = hcipy.ShackHartmannWavefrontSensorEstimator(square.mla_grid, square.mla_index)
     np.testing.assert_array_equal(estimator.estimation_subapertures, own.estimation_subapertures)
@@ -180,27 +187,16 @@ def test_axes_that_run_backwards(optics: Any) -> None:
     ("change", "message"),
     [
         ({"detector_grid": "polar"}, "regular two-dimensional Cartesian"),
-        ({"detector_grid": "separated"}, "regular two-dimensional Cartesian"),
         ({"mla_index": np.zeros(84 * 84)}, "detector_grid: expected an hcipy.Grid"),
-        ({"mla_grid": np.zeros((49, 2))}, "mla_grid: expected"),
         ({"mla_grid": "far"}, "on the detector"),
         ({"mla_grid": "dense"}, "px between centres"),
         ({"estimation_subapertures": np.ones(7, bool)}, "expected a mask of 49"),
-        ({"estimation_subapertures": np.zeros(49, bool)}, "at least one lenslet"),
         ({"pixels": 14}, "49 lenslets|leave it|overlap"),
-        ({"pixels": 1}, "pixels = 1"),
-        ({"settings": Settings(estimator="ml")}, "calibration.read_noise_e"),
     ],
 )
 def test_refused_in_one_line(optics: Any, change: dict[str, Any], message: str) -> None:
     grid, mla = optics.mla_index.grid, optics.mla_grid
-    x = np.linspace(-1, 1, 84) ** 3
-    grids = {
-        "polar": grid.as_("polar"),
-        "separated": hcipy.CartesianGrid(hcipy.SeparatedCoords((x, x))),
-        "far": mla.shifted((1.0, 0.0)),
-        "dense": mla.scaled(0.1),
-    }
+    grids = {"polar": grid.as_("polar"), "far": mla.shifted((1.0, 0.0)), "dense": mla.scaled(0.1)}
     arguments = {"mla_grid": mla, "mla_index": optics.mla_index, "settings": FAINT}
     arguments |= {name: grids[value] if isinstance(value, str) else value for name, value in change.items()}
     with refused(match=message):
@@ -209,13 +205,8 @@ def test_refused_in_one_line(optics: Any, change: dict[str, Any], message: str) 
 
 def test_calibration_and_prediction(optics: Any) -> None:
     asked: list[Any] = []
-
-    def predict(slopes: Any) -> Any:
-        asked.append(slopes)
-        return None
-
     settings = Settings("window", flux_e=30.0, spot_fwhm_px=2.0)
-    estimator = SlopeEstimator(optics.mla_grid, optics.mla_index, settings=settings, predict=predict)
+    estimator = SlopeEstimator(optics.mla_grid, optics.mla_index, settings=settings, predict=asked.append)
     image = image_through(optics)
     with estimator.calibrating():
         bright, faint = (np.asarray(estimator.estimate([image * scale])) for scale in (1.0, 1e-5))
@@ -245,17 +236,3 @@ def test_predictions_are_in_metres_on_the_detector(optics: Any) -> None:
     estimator.estimate([image])
     slopes = np.asarray(estimator.estimate([image]))
     np.testing.assert_allclose(slopes, predicted_m, rtol=0, atol=0.02 * PIXEL_M)
-
-
-def test_images_that_do_not_fit(optics: Any) -> None:
-    estimator = SlopeEstimator(optics.mla_grid, optics.mla_index, settings=FAINT)
-    image = image_through(optics)
-    other = hcipy.Field(np.asarray(image), hcipy.make_pupil_grid(84, 1.0))
-    for images, message in (
-        (image, "list of one image"),
-        ([], "list of one image"),
-        ([image[:-1]], "list of one image"),
-        ([other], "another grid"),
-    ):
-        with pytest.raises(InputError, match=message):
-            estimator.estimate(images)

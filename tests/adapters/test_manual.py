@@ -1,6 +1,6 @@
 """The scripts in the manual of other tools run as they stand, but for shorter recordings.
 
-Filters learn from 400 to 600 frames. Strehl ratios are means of 100 frames or more, of one realisation, and
+Filters learn from 350 to 450 frames. Strehl ratios are means of 100 frames or more, of one realisation, and
 limits are wide; the stored results of foreign loops compare controls.
 """
 
@@ -16,13 +16,15 @@ from tests.shared_data import ROOT
 MANUAL = ROOT / "docs" / "adapters"
 STREHL = r"Strehl ratio ([\d.]+)"
 SHORTER = {
-    "hcipy": {"np.arange(100, 2250)": "np.arange(100, 700)", "np.arange(2250, 2950)": "np.arange(700, 1100)"},
-    "oopao": {"signal, 2150)": "signal, 750)", "run(predictive, 700)": "run(predictive, 400)"},
+    "hcipy": {"np.arange(100, 2250)": "np.arange(100, 600)", "np.arange(2250, 2950)": "np.arange(600, 850)"},
+    "oopao": {"signal, 2150)": "signal, 600)", "run(predictive, 700)": "run(predictive, 250)"},
     "specula": {
-        "total_time: 8.6": "total_time: 2.2",
-        "total_time: 1.6": "total_time: 0.8",
-        "override: {start_time: 0.6": "override: {start_time: 0.4",
+        "total_time: 8.6": "total_time: 2.0",
+        "total_time: 1.6": "total_time: 0.6",
+        "override: {start_time: 0.6": "override: {start_time: 0.3",
     },
+    "soapy": {"reconstruct, 900)": "reconstruct, 500)", "run(predictive, 400)": "run(predictive, 250)"},
+    "pyrtc": {"8, 900, 50": "8, 500, 50", "size=2048": "size=1024"},
 }
 PYRAMIDS = ("specula",)
 """Pages whose third script replaces the lenslets by a pyramid, and runs after the others."""

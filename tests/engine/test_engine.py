@@ -25,7 +25,6 @@ from faintspot.engine.frames.workers import PipelineMaker
 from faintspot.engine.processes.requests import request, socket_path
 from faintspot.engine.processes.segment import FOLDER
 from faintspot.engine.request_handlers import commands_of
-from faintspot.engine.streams.bridge import StreamBridge
 from faintspot.slopes.pipeline import configuration
 
 pyshmem = pytest.importorskip("pyshmem")
@@ -101,24 +100,6 @@ def test_frames_of_a_ring_that_was_waited_for_count(bench: Bench, monkeypatch: p
     counters = bench.engine.counters
     assert (counters.processed + counters.dropped, counters.skipped) == (10, 0)
     assert 9 in bench.slopes
-
-
-def test_frames_of_a_stream() -> None:
-    """The engine follows a pyshmem stream itself, also when it comes back."""
-    data = simulated(4)
-    expected = make(SETTINGS)(data).vector
-    name = f"fs_test_{uuid4().hex[:12]}"
-    with Bench(f"{name}_ring", source=StreamBridge(name, f"{name}_ring")) as bench:
-        for _ in range(2):
-            stream, sent = pyshmem.create(name, shape=data.shape[1:], dtype=np.uint16), bench.engine.counters
-            for number in (1, 2, 3):
-                before = sent.processed
-                while sent.processed == before:  # the first ones come before it looks
-                    stream.write(data[number], frame_id=number)
-            stream.close()
-            pyshmem.unlink(name)
-        assert bench.engine.counters.processed >= 6
-        assert np.array_equal(bench.slopes[3], expected[3])
 
 
 def test_new_spots_are_measured_with_from_the_next_frame(bench: Bench, tmp_path: Path) -> None:
