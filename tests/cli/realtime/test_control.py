@@ -1,6 +1,11 @@
-"""faintspot realtime send and status, with an engine in the process of the test."""
+"""faintspot realtime send and status, with an engine in the process of the test; faintspot live."""
 
 import json
+import signal
+import subprocess
+import sys
+import urllib.error
+import urllib.request
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -10,6 +15,7 @@ import click
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from tests.cli.cli_cases import Commands
 
 from faintspot.cli.realtime.control import send, status
 from faintspot.cli.realtime.run import run
@@ -18,6 +24,8 @@ from faintspot.engine.request_handlers import commands_of
 from faintspot.loop.control.configuration import Control
 
 pytest.importorskip("pyshmem")
+pytest.importorskip("tornado")
+pytest.importorskip("zarr")
 
 from tests.engine.bench import LAYOUT, Bench, simulated
 
@@ -54,22 +62,20 @@ def test_the_loop_by_the_command_line(bench: Bench) -> None:
     everything = json.loads(said(status, *name, "--json"))["loop"]
     assert (everything["state"], everything["commands"]) == ("open", 10)
     assert everything["latency"]["count"] == 3
-    assert bench.records["commands"].any()
+    sent = bench.records["commands"]
+    assert sent.any()
+    bench.detached()
+    bench.measure(simulated(2))
+    assert not bench.records["commands"][-2:].any()  # the mirror is flat
     assert said(status, *name, "max_bad_fraction") == "max_bad_fraction = 0.25\n"
     assert "keep_brightest = " in said(status, *name, "all")
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
+    for changes, message in (
         (["loop=shut"], "action = 'shut': expected one of"),
         (["loop=open", "noise_std=1"], "noise_std: unknown name beside loop; known: loop"),
         (["methods=none,tv", "evry=3"], "evry: unknown name beside methods; did you mean every?"),
         (["gain=0.3", "--subapertures", "1"], "--subapertures: expected settings"),
-    ],
-)
-def test_what_send_refuses(bench: Bench, changes: list[str], message: str) -> None:
-    assert message in said(send, "--name", bench.name, *changes)
+    ):
+        assert message in said(send, *name, *changes)
 
 
 def test_an_engine_without_control() -> None:
@@ -93,3 +99,25 @@ def test_what_a_start_refuses(tmp_path: Path, control: str, options: list[str], 
     result = CliRunner().invoke(run, arguments, standalone_mode=False)
     assert message in str(result.exception)
     assert "\n" not in str(result.exception)
+
+
+COMMAND = [sys.executable, "-m", "faintspot", "live"]
+
+
+def test_page_is_served_until_it_is_ended(tmp_path: Path, run: Commands) -> None:
+    run.refused("live", "--bind", "everywhere", "--port", 0, naming=("expected an IP address",))
+    run.refused("live", "--name", "../x", "--port", 0, naming=("name = '../x'",))
+    command = [*COMMAND, "--name", "fs_test_live", "--port", "0"]  # whose engine has not started
+    with subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, text=True) as process:
+        try:
+            assert process.stdout is not None
+            url, _, token = process.stdout.readline().strip().partition("#")
+            assert len(token) >= 32
+            with urllib.request.urlopen(url) as page:
+                assert b"<title>faintspot</title>" in page.read()
+            with pytest.raises(urllib.error.HTTPError, match="403"):
+                urllib.request.urlopen(urllib.request.Request(url, headers={"Host": "example.org"}))
+            process.send_signal(signal.SIGTERM)
+            assert process.wait(60) == 0
+        finally:
+            process.kill()

@@ -130,16 +130,6 @@ def test_table_has_the_gain_over_the_first_method() -> None:
 
 
 @pytest.mark.slow
-def test_what_was_not_seen_is_said() -> None:
-    assert in_words(Shown(2)) == ["ended before there was a loop"]
-    early = shown(2)
-    assert early.by_method() == []
-    assert in_words(early)[-1] == "ended before every method had its turn"
-    nothing = Shown(2)
-    assert np.isnan([nothing.open_strehl, nothing.on_time]).all()
-
-
-@pytest.mark.slow
 def test_bad_options_used_names_and_missing_packages_are_refused(
     folder: Path, run: Commands, name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
