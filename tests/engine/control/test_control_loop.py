@@ -166,7 +166,8 @@ def test_commands_are_minus_the_gain_times_the_wavefront_of_true_slopes() -> Non
     for number in range(3):
         slopes = frame_of(rng)
         measured = np.concatenate([slopes.x, slopes.y]) / 0.5
-        expected = 0.98 * expected - 0.3 * loop.control.reconstructor.matrix @ measured
+        gain = loop.gain = 0.3 if number < 2 else 0.15
+        expected = 0.98 * expected - gain * loop.control.reconstructor.matrix @ measured
         np.testing.assert_allclose(loop.follow(slopes, number), expected, atol=1e-5)
         loop.look_after(slopes.flux)
         rms = np.sqrt(np.mean(measured**2))
@@ -228,7 +229,8 @@ def test_a_controller_that_fails_opens_the_loop(step: str, monkeypatch: pytest.M
 
     monkeypatch.setattr(loop.controller, step, fail)
     assert not loop.begin_product()
-    np.testing.assert_array_equal(loop.follow(frame_of(rng), 1), held)
+    for number in (1, 2):
+        np.testing.assert_array_equal(loop.follow(frame_of(rng), number), held)
     assert not loop.closed
     assert "no product" in loop.opened_because
 

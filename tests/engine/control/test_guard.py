@@ -138,6 +138,7 @@ def test_a_loop_is_closed_again_at_half_the_invalid_slopes(part: float, again: b
 def test_without_a_number_of_frames_no_loop_is_proven(proven_frames: int, again: bool) -> None:
     guard = guarded(proven_frames=proven_frames)
     assert reason(guard, invalid=1.0)
+    assert not guard.flattens  # the mirror keeps what it has
     for _ in range(300):
         guard.watch(np.zeros(8), FLAT, FLUX)
     assert guard.may_close_again == again

@@ -127,6 +127,26 @@ def test_rows_frames_and_laps(name: str) -> None:
         assert not reader.cells.flags.writeable
 
 
+def test_repeats_skips_and_short_frames_are_seen(name: str) -> None:
+    with PixelRing.create(name, SHAPE, np.float32) as ring, PixelRing.attach(name) as reader:
+        ring.publish(np.full(SHAPE, 1.0), 5)
+        assert reader.intact(5, 1)
+        ring.publish(np.full(SHAPE, 2.0), 5)
+        assert reader.intact(5)
+        assert not reader.intact(5, 1)
+        assert reader.arrivals == 2
+        ring.publish(np.full(SHAPE, 3.0), 50)
+        assert reader.progress() == (50, SHAPE[0])
+        assert not reader.intact(49)
+        ring.begin(51)
+        ring.rows_ready(4)
+        ring.begin(52)  # 51 was cut short
+        assert reader.last_row_time_ns(51) == 0
+        assert reader.progress() == (52, 0)
+        ring.publish(np.zeros(SHAPE), 3)  # the camera counts anew
+        assert reader.progress() == (3, SHAPE[0])
+
+
 def test_progress_does_not_mix_two_frames(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """A frame that begins between the looks at number and rows: it looks again."""
 

@@ -59,6 +59,11 @@ def test_none_needs_an_estimator_that_denoises() -> None:
         method.of(fs.Settings("ml"))
 
 
+def test_methods_take_turns() -> None:
+    found = Interleaving.parse("none,tv,ml", 2)
+    assert [found.method_of(count) for count in range(8)] == [0, 0, 1, 1, 2, 2, 0, 0]
+
+
 def test_anything_else_is_refused() -> None:
     nonsense = "", "tvv", "none,,tv", "strength=2", "noise_std=", "tv:", "kalmann", "tv+", "tv+none"
     for text in (*nonsense, "tv+kalman+tv"):

@@ -75,6 +75,14 @@ def test_dark_subapertures_have_slopes_of_0_and_others_the_same() -> None:
     assert np.array_equal(path.slopes.vector, before)
 
 
+def test_small_windows_are_not_followed() -> None:
+    layout = fs.Layout.grid((4, 4), pixels=2)
+    follower = DarkFollower(fs.SlopePipeline(layout, fs.Settings("centroid")))
+    for _ in range(9 * EVERY):
+        follower.take(np.zeros((1, 8, 8), np.float32))
+    assert not follower.look()
+
+
 def test_the_mean_is_that_of_all_frames_and_then_of_the_latest() -> None:
     """Each frame then counts 1 - 1 / T as much as the next, with a time constant of T = 120 frames."""
     seen: list[MeanFlux] = []
