@@ -12,7 +12,7 @@ from typing import Any, TypedDict, Unpack
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from faintspot.base.checks import finite_array, not_none, number_between, real_array
+from faintspot.base.checks import check_shape, finite_array, not_none, number_between, real_array
 from faintspot.base.errors import InputError
 from faintspot.base.text_files import check_keys
 from faintspot.slopes.camera.calibration import Calibration
@@ -292,8 +292,7 @@ class ToolSlopes:
         pipeline, calibration = self.pipeline, self.pipeline.calibration
         layout = pipeline.layout
         array = finite_array("calibration frame", frame)
-        if array.shape != layout.frame_shape:
-            raise InputError(f"calibration frame: expected shape {layout.frame_shape}, got {array.shape}")
+        check_shape("calibration frame", array, layout.frame_shape)
         dark, e_per_adu = calibration.maps(layout.frame_shape)
         images = layout.images((array - dark) * e_per_adu)
         flux = np.nansum(images, axis=(1, 2))

@@ -69,6 +69,22 @@ def finite_array(name: str, value: object, *, minimum_dimensions: int = 0) -> ND
     return array
 
 
+def check_shape(name: str, array: NDArray[Any], *shapes: tuple[int | str, ...]) -> None:
+    """Check that an array has one of some shapes; a text stands for any length, as in ("n", 2).
+
+    Raises
+    ------
+    InputError
+        If it has another one.
+    """
+    for shape in shapes:
+        pairs = zip(shape, array.shape, strict=False)
+        if len(shape) == array.ndim and all(isinstance(n, str) or n == found for n, found in pairs):
+            return
+    expected = " or ".join(f"({', '.join(map(str, shape))}{',' * (len(shape) == 1)})" for shape in shapes)
+    raise InputError(f"expected shape {expected}, got {array.shape}", name=name)
+
+
 def image_stack(name: str, value: object) -> NDArray[np.floating[Any]]:
     """Return `value` as finite float32 or float64 images (..., ny, nx), contiguous.
 

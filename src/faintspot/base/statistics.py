@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from faintspot.base.arrays import Floats
-from faintspot.base.checks import finite_array, number_between
-from faintspot.base.errors import InputError
+from faintspot.base.checks import check_shape, finite_array, number_between
 
 OUTLIER_PX = 1.0
 """An error beyond this on either axis is an outlier: half the width of a Nyquist-sampled spot. It does not
@@ -97,8 +96,7 @@ def absolute_errors(x: ArrayLike, y: ArrayLike, truth: ArrayLike) -> NDArray[np.
     """
     estimates = np.stack([finite_array("x", x), finite_array("y", y)], axis=-1).astype(np.float64)
     true_positions = finite_array("truth", truth)
-    if estimates.shape != true_positions.shape:
-        raise InputError(f"truth: expected shape {estimates.shape}, got {true_positions.shape}")
+    check_shape("truth", true_positions, estimates.shape)
     return np.mean(np.abs(estimates - true_positions), axis=-1)  # type: ignore[no-any-return]
 
 

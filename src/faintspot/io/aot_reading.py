@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.base.checks import finite_array
+from faintspot.base.checks import check_shape, finite_array
 from faintspot.base.errors import InputError, MissingExtraError
 from faintspot.base.files import check_bytes, memory_bytes
 from faintspot.io.fits_units import AOT_VERSION, SIDE, is_aot, units_of
@@ -268,9 +268,8 @@ def _data_of(owner: object, name: str, *shape: int | str) -> Any:
     if image is None or image.data is None:
         return None
     data = np.asarray(image.data)
-    wanted = [size if isinstance(word, str) else word for word, size in zip(shape, data.shape, strict=False)]
-    if shape and (len(shape) != data.ndim or list(data.shape) != wanted):
-        raise InputError(f"{name}: expected shape ({', '.join(map(str, shape))}), got {data.shape}")
+    if shape:
+        check_shape(name, data, shape)
     return data.astype(data.dtype.newbyteorder("="), copy=False)
 
 

@@ -8,6 +8,7 @@ from typing import IO, Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from faintspot.base.checks import check_shape
 from faintspot.base.errors import InputError
 from faintspot.base.files import check_bytes, memory_bytes
 from faintspot.base.flags import VARIABLES
@@ -168,8 +169,7 @@ def checked_block(
     arrays = {}
     for name, values in with_absent(block).items():
         array = np.asarray(values)
-        if array.shape != (n, run.n_subapertures):
-            raise InputError(f"slopes: {name}: expected shape {(n, run.n_subapertures)}, got {array.shape}")
+        check_shape(f"slopes: {name}", array, (n, run.n_subapertures))
         arrays[name] = array.astype(VARIABLES[name].dtype, copy=False)
     return arrays
 

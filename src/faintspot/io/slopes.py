@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.base.checks import finite_array, number_between, one_of
+from faintspot.base.checks import check_shape, finite_array, number_between, one_of
 from faintspot.base.errors import InputError, MissingExtraError, errors_within, present
 from faintspot.base.files import check_regular, output_errors
 from faintspot.base.flags import VARIABLES, leave_out, scaled_positions
@@ -212,8 +212,7 @@ def _checked_run(
         if name in VARIABLES or name == "attributes":
             raise InputError(f"coordinates: {name!r} is the name of a variable; choose another name")
         array = finite_array(f"coordinates: {name}", coordinate)
-        if array.shape != (subapertures,):
-            raise InputError(f"coordinates: {name}: expected shape ({subapertures},), got {array.shape}")
+        check_shape(f"coordinates: {name}", array, (subapertures,))
         values[name] = array.astype(np.float64 if array.dtype.kind == "f" else np.int64)
     return RecordingHeader(frames, subapertures, json_values(attributes), values)
 

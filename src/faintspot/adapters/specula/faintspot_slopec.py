@@ -15,6 +15,7 @@ from faintspot.adapters.base import (
     check_version,
     parts_of,
 )
+from faintspot.base.checks import check_shape
 from faintspot.base.errors import InputError, MissingExtraError
 from faintspot.slopes.sensor.layout import Layout
 
@@ -147,8 +148,7 @@ class FaintspotSlopec(Slopec):  # type: ignore[misc]
         if self._tool is None:
             self._tool, self._idxs = self._prepared((int(pixels.shape[0]), int(pixels.shape[1])))
             self._frame_shape = pixels.shape
-        if pixels.shape != self._frame_shape:
-            raise InputError(f"in_pixels: expected shape {self._frame_shape}, got {pixels.shape}")
+        check_shape("in_pixels", pixels, self._frame_shape)
         images, n = pixels.ravel()[self._idxs], self.nsubaps()
         null = np.zeros((2, n)) if self.sn is None else _two_rows("sn", self.sn, n)
         prior, predicted = None, self.local_inputs.get("in_predicted")

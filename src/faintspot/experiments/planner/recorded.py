@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from faintspot.base.checks import finite_array, not_none
+from faintspot.base.checks import check_shape, finite_array, not_none
 from faintspot.base.errors import InputError
 from faintspot.experiments.planner.promise import frames_to_check, images_e
 from faintspot.experiments.planner.question import (
@@ -153,8 +153,7 @@ def _check_flux(stack: NDArray[np.generic], dark: object, layout: Layout, gain: 
 
 def _stack(name: str, value: object) -> NDArray[np.generic]:
     array = finite_array(name, value, minimum_dimensions=2)
-    if array.ndim > 3:
-        raise InputError(f"{name}: expected (n, h, w) or (h, w), got shape {array.shape}")
+    check_shape(name, array, ("n", "h", "w"), ("h", "w"))
     return array if array.ndim == 3 else array[None]
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.arrays import Floats
-from faintspot.base.checks import finite_array
+from faintspot.base.checks import check_shape, finite_array
 from faintspot.base.errors import InputError, errors_within
 from faintspot.base.tables import Tables, save_tables
 from faintspot.base.text_files import check_keys
@@ -90,8 +90,7 @@ class Control:
             reference = finite_array(REFERENCE, reference).astype(np.float64)
             if reference.shape == (len(matrix) // 2, 2):
                 reference = reference.T.reshape(-1)
-            if reference.shape != (len(matrix),):
-                raise InputError(f"expected shape ({len(matrix)},), got {reference.shape}", name=REFERENCE)
+            check_shape(REFERENCE, reference, (len(matrix),))
             if np.abs(reference).max() > _LARGEST_SLOPE_PX:
                 raise InputError(f"expected positions up to {_LARGEST_SLOPE_PX:g} px", name=REFERENCE)
         object.__setattr__(self, "interaction", matrix)

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from faintspot.base.arrays import Floats
-from faintspot.base.checks import finite_array, number_between
+from faintspot.base.checks import check_shape, finite_array, number_between
 from faintspot.base.errors import InputError
 
 LARGEST_CORRELATION = 0.99  # of x and y: a narrower ellipse is not known from one frame
@@ -122,8 +122,7 @@ def make_reconstructor(
         too large to compute with.
     """
     matrix: Floats = finite_array("interaction", interaction).astype(np.float64)
-    if matrix.ndim != 2:
-        raise InputError(f"interaction: expected shape (2 n, commands), got {matrix.shape}")
+    check_shape("interaction", matrix, ("2 n", "commands"))
     slopes, commands = matrix.shape
     check_controllable(commands, slopes)
     limit = number_between("largest_condition", largest_condition, 1)

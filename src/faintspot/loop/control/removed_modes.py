@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from faintspot.base.arrays import Floats
-from faintspot.base.checks import finite_array, one_of
+from faintspot.base.checks import check_shape, finite_array, one_of
 from faintspot.base.errors import InputError
 from faintspot.base.flags import UNMEASURED
 from faintspot.loop.control.integrator import MEAN_SQUARE
@@ -133,8 +133,7 @@ def _focus(positions: ArrayLike | None) -> Floats:
     if positions is None:
         raise InputError("removed_modes: expected the positions of the sub-apertures, to remove focus")
     centred = finite_array("positions", positions).astype(np.float64)
-    if centred.ndim != 2 or centred.shape[1] != 2:
-        raise InputError(f"positions: expected shape (n, 2), got {centred.shape}")
+    check_shape("positions", centred, ("n", 2))
     centred = centred - centred.mean(axis=0)
     size = float(np.abs(centred).max(initial=0.0))
     if not size > _LEAST_SPREAD:

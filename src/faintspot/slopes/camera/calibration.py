@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from faintspot.base.checks import number_between, numbers_between, real_array
+from faintspot.base.checks import check_shape, number_between, numbers_between, real_array
 from faintspot.base.errors import InputError, errors_within
 from faintspot.base.files import derived, save_arrays
 from faintspot.base.options import TEXTS, number, setting
@@ -31,8 +31,7 @@ def _map(name: str, value: object) -> NDArray[np.float64]:
     if any(isinstance(item, bool) for row in rows for item in row):
         raise InputError("expected numbers, got true or false", name=name)
     array = real_array(name, value).astype(np.float64)
-    if array.ndim != 2:
-        raise InputError(f"expected shape (h, w), got {array.shape}", name=name)
+    check_shape(name, array, ("h", "w"))
     array.flags.writeable = False
     return array
 

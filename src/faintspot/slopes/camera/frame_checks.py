@@ -6,8 +6,7 @@ import numpy as np
 import scipy
 from numpy.typing import ArrayLike, NDArray
 
-from faintspot.base.checks import real_array
-from faintspot.base.errors import InputError
+from faintspot.base.checks import check_shape, real_array
 from faintspot.base.statistics import mad_std
 
 # Standard deviation of spots below which a pixel differs from its neighbours without a filter, too: those of
@@ -218,8 +217,7 @@ def find_hot_pixels(frame: ArrayLike) -> NDArray[np.int64]:
     from scipy.ndimage import median_filter, minimum_filter, rank_filter
 
     image = real_array("frame", frame, minimum_dimensions=2).astype(np.float64)
-    if image.ndim != 2:
-        raise InputError(f"frame: expected shape (h, w), got {image.shape}")
+    check_shape("frame", image, ("h", "w"))
     not_finite = ~np.isfinite(image)
     image[not_finite] = np.median(image[~not_finite]) if not not_finite.all() else 0.0
     ring = np.ones((3, 3), bool)

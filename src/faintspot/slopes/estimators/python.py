@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.base.checks import LARGEST_FLOAT32, not_none
+from faintspot.base.checks import LARGEST_FLOAT32, check_shape, not_none
 from faintspot.base.errors import InputError
 from faintspot.base.flags import UNMEASURED, SubapertureFlag
 from faintspot.slopes.estimators.base import Estimator, EstimatorPlan, Positions
@@ -99,14 +99,13 @@ class PythonPlan(EstimatorPlan):
             found = self.estimator.locate(images, self.sensor, prior)
             if not isinstance(found, Positions):
                 array = np.asarray(found, np.float64)
-                if array.shape != (n, 2):
-                    raise InputError(f"locate: expected shape ({n}, 2), got {array.shape}")
+                check_shape("locate", array, (n, 2))
                 found = Positions(array[:, 0], array[:, 1])
             found = found._replace(flux=flux if found.flux is None else found.flux)
             values = [None if value is None else np.asarray(value, np.float64) for value in found]
             for name, value in zip(Positions._fields, values, strict=True):
-                if value is not None and value.shape != (n,):
-                    raise InputError(f"locate: {name}: expected shape ({n},), got {value.shape}")
+                if value is not None:
+                    check_shape(f"locate: {name}", value, (n,))
         return Positions(*values)  # type: ignore[arg-type]
 
     def locate_frame(

@@ -7,7 +7,7 @@ import numpy as np
 import scipy
 from numpy.typing import ArrayLike, NDArray
 
-from faintspot.base.checks import LARGEST_FLOAT32, real_array
+from faintspot.base.checks import LARGEST_FLOAT32, check_shape, real_array
 from faintspot.base.errors import InputError
 from faintspot.base.flags import UNMEASURED, SubapertureFlag, scaled_positions
 from faintspot.base.statistics import FWHM_TO_STD, mad_std
@@ -346,8 +346,7 @@ def measure_images(
     tv: R = 0.073 px
     """
     stack = real_array("images", images)
-    if stack.ndim != 3:
-        raise InputError(f"images: expected shape (n, ny, nx), got {stack.shape}")
+    check_shape("images", stack, ("n", "ny", "nx"))
     n, ny, nx = stack.shape
     layout = Layout.stacked(n, (ny, nx))
     pipeline = SlopePipeline(layout, settings, calibration, psf=psf, weights=weights)

@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from faintspot.base.checks import not_none, number_between, numbers_between, real_array
-from faintspot.base.errors import InputError
+from faintspot.base.checks import check_shape, not_none, number_between, numbers_between, real_array
 from faintspot.slopes.kernels.gather import Frames
 from faintspot.slopes.kernels.host import WIDTHS, lanes_for
 from faintspot.slopes.kernels.validity.dark import MOST_LANES, LightTest, scratch_size, significances
@@ -146,8 +145,7 @@ class MeanFlux:
 
     def __post_init__(self) -> None:
         flux = numbers_between("flux_e", self.flux_e, -1e12, 1e12)
-        if flux.ndim not in (1, 2):
-            raise InputError(f"flux_e: expected shape (n,) or (n_frames, n), got {flux.shape}")
+        check_shape("flux_e", flux, ("n",), ("n_frames", "n"))
         number_between("time_constant_frames", self.time_constant_frames, 1.0)
         count = 1 if flux.ndim == 1 else len(flux)
         frames = number_between("frames", count if self.frames is None else self.frames, 0.0, low_open=True)
@@ -165,8 +163,7 @@ class MeanFlux:
             If the number of sub-apertures differs.
         """
         flux = real_array("flux_e", flux_e)
-        if flux.shape != self.flux_e.shape:
-            raise InputError(f"flux_e: expected shape {self.flux_e.shape}, got {flux.shape}")
+        check_shape("flux_e", flux, self.flux_e.shape)
         frames = min(not_none(self.frames) + 1.0, self.time_constant_frames)
         change = np.where(np.isfinite(flux), flux - self.flux_e, 0.0) / frames
         return replace(self, flux_e=self.flux_e + change, frames=frames)

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
-from faintspot.base.checks import number_between, numbers_between, real_array
+from faintspot.base.checks import check_shape, number_between, numbers_between, real_array
 from faintspot.base.errors import InputError
 from faintspot.base.flags import scaled_positions
 from faintspot.slopes.camera.calibration import Calibration, binned, binned_calibration, spread
@@ -339,11 +339,7 @@ class SlopePipeline:
     def checked(self, frame: ArrayLike) -> NDArray[np.generic]:
         """Return one or several frames as an array; raise InputError if they do not fit the layout."""
         array = real_array("frame", frame, minimum_dimensions=2)
-        if array.ndim > 3 or array.shape[-2:] != self.layout.frame_shape:
-            height, width = self.layout.frame_shape
-            raise InputError(
-                f"frame: expected shape ({height}, {width}) or (n, {height}, {width}), got {array.shape}"
-            )
+        check_shape("frame", array, self.layout.frame_shape, ("n", *self.layout.frame_shape))
         return array
 
     def _run(

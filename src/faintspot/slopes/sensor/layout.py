@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from faintspot.base.checks import number_between, numbers_between
+from faintspot.base.checks import check_shape, number_between, numbers_between
 from faintspot.base.errors import DoubtWarning, InputError, drawn, errors_within
 from faintspot.base.files import check_size
 from faintspot.base.options import TEXTS, number, setting
@@ -426,6 +426,5 @@ class Layout(ConfigurationTable, table="layout"):
 
 def _rows_of_two(name: str, value: object) -> NDArray[Any]:
     array = numbers_between(name, value)
-    if array.ndim != 2 or array.shape[1] != 2:
-        raise InputError(f"{name}: expected shape (n, 2), got {array.shape}")
+    check_shape(name, array, ("n", 2))
     return array

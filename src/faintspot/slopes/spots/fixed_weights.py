@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from faintspot.base.arrays import Floats
-from faintspot.base.checks import finite_array, number_between, numbers_between
+from faintspot.base.checks import check_shape, finite_array, number_between, numbers_between
 from faintspot.base.errors import InputError
 from faintspot.slopes.spots.psf import PSF, Indexed
 
@@ -101,8 +101,7 @@ class FixedWeights(Indexed):
                 continue
             maps = numbers_between(f"weights.{name}", getattr(self, name), -_LARGEST, _LARGEST)
             maps = maps[None] if maps.ndim == 2 else maps
-            if maps.ndim != 3:
-                raise InputError(f"weights.{name}: expected shape (n_kinds, ny, nx), got {maps.shape}")
+            check_shape(f"weights.{name}", maps, ("n_kinds", "ny", "nx"))
             values[name] = maps.astype(np.float64)
             if maps.shape != values["x"].shape:
                 raise InputError(f"weights.{name}: expected shape {values['x'].shape} as x, got {maps.shape}")

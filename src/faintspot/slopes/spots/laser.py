@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from faintspot.base.arrays import Floats
-from faintspot.base.checks import number_between, numbers_between
+from faintspot.base.checks import check_shape, number_between, numbers_between
 from faintspot.base.errors import InputError
 from faintspot.base.files import check_size
 from faintspot.slopes.spots.psf import PSF
@@ -83,8 +83,7 @@ class LaserGuideStar:
 
     def __post_init__(self) -> None:
         positions = numbers_between("star.subapertures_m", self.subapertures_m, -1e3, 1e3)
-        if positions.ndim != 2 or positions.shape[1] != 2:
-            raise InputError(f"star.subapertures_m: expected shape (n, 2), got {positions.shape}")
+        check_shape("star.subapertures_m", positions, ("n", 2))
         launch = numbers_between("star.launch_m", self.launch_m, -1e3, 1e3)
         if launch.shape != (2,):
             raise InputError(f"star.launch_m: expected x and y, got shape {launch.shape}")
@@ -244,8 +243,7 @@ class LaserGuideStar:
         """Return the places of rows and columns [px], and checked positions (n, 2)."""
         sides = image_shape("shape", shape)
         where = np.zeros((len(self), 2)) if positions is None else position_array(positions)
-        if where.shape != self.subapertures_m.shape:
-            raise InputError(f"positions: expected shape {self.subapertures_m.shape}, got {where.shape}")
+        check_shape("positions", where, self.subapertures_m.shape)
         rows, columns = (np.arange(side, dtype=np.float64) - 0.5 * (side - 1) for side in sides)
         return rows, columns, where
 

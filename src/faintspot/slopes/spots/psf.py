@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from faintspot.base.arrays import Floats
-from faintspot.base.checks import LARGEST_FLOAT32, number_between, numbers_between
+from faintspot.base.checks import LARGEST_FLOAT32, check_shape, number_between, numbers_between
 from faintspot.base.errors import InputError, drawn
 from faintspot.base.files import NpzFile, check_size
 from faintspot.slopes.spots.shapes import image_shape, per_spot, position_array, spots
@@ -39,8 +39,7 @@ class Indexed(NpzFile):
         if self.index is None:
             return
         index = numbers_between(f"{self.NAME}.index", self.index, 0, n_kinds - 1, integer=True)
-        if index.ndim != 1:
-            raise InputError(f"{self.NAME}.index: expected shape (n_subapertures,), got {index.shape}")
+        check_shape(f"{self.NAME}.index", index, ("n_subapertures",))
         index.flags.writeable = False
         object.__setattr__(self, "index", index)
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from faintspot.base.arrays import Floats
-from faintspot.base.checks import finite_array, numbers_between, one_of
+from faintspot.base.checks import check_shape, finite_array, numbers_between, one_of
 from faintspot.base.errors import InputError
 from faintspot.base.files import check_size
 
@@ -179,8 +179,7 @@ def image_shape(name: str, shape: object) -> tuple[int, int]:
 def position_array(positions: object) -> Floats:
     """Return positions as float64 of shape (n, 2), or raise an InputError."""
     checked = finite_array("positions", positions).astype(np.float64)
-    if checked.ndim != 2 or checked.shape[1] != 2:
-        raise InputError(f"positions: expected shape (n, 2) holding x and y, got {checked.shape}")
+    check_shape("positions", checked, ("n", 2))
     return checked
 
 

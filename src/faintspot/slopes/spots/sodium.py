@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from faintspot.base.arrays import Floats
-from faintspot.base.checks import number_between, numbers_between
+from faintspot.base.checks import check_shape, number_between, numbers_between
 from faintspot.base.errors import InputError
 from faintspot.base.files import NpzFile
 from faintspot.base.statistics import FWHM_TO_STD
@@ -62,8 +62,7 @@ class SodiumProfile(NpzFile):
             )
         if np.any(np.diff(altitudes) <= 0):
             raise InputError("profile.altitudes_m: expected increasing altitudes, got others")
-        if density.shape != altitudes.shape:
-            raise InputError(f"profile.density: expected shape {altitudes.shape}, got {density.shape}")
+        check_shape("profile.density", density, altitudes.shape)
         density = density / max(density.max(), np.finfo(float).tiny)
         total = float(np.trapezoid(density, altitudes))
         if not total > 0:

@@ -8,8 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from faintspot.base.arrays import Floats
-from faintspot.base.checks import finite_array, number_between, numbers_between, spawn
-from faintspot.base.errors import InputError
+from faintspot.base.checks import check_shape, finite_array, number_between, numbers_between, spawn
 from faintspot.slopes.spots.shapes import SMALLEST_SIZE, image_shape, per_spot, structure_function
 
 LARGEST_D_OVER_R0 = 10.0
@@ -110,8 +109,7 @@ def true_positions(
     if positions is None:
         return rng.uniform(-half, half, shape)
     given = finite_array("positions", positions).astype(np.float64)
-    if given.shape not in (shape, shape[-2:]):
-        raise InputError(f"positions: expected shape {shape[-2:]} or {shape}, got {given.shape}")
+    check_shape("positions", given, shape[-2:], shape)
     return np.broadcast_to(given, shape).copy()
 
 

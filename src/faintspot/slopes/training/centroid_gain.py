@@ -11,7 +11,7 @@ import scipy
 from numpy.typing import ArrayLike
 
 from faintspot.base.arrays import Floats
-from faintspot.base.checks import finite_array
+from faintspot.base.checks import check_shape, finite_array
 from faintspot.base.errors import InputError
 from faintspot.slopes.pipeline.slopes import Slopes
 from faintspot.slopes.spots.psf import PSF
@@ -97,10 +97,7 @@ def measure_centroid_gain(slopes: Slopes | ArrayLike, displacement_px: ArrayLike
     n = measured.shape[1] // 2
     if moved.shape == (len(measured), 2):
         moved = np.repeat(moved, n, axis=1)
-    if moved.shape != measured.shape:
-        raise InputError(
-            f"displacement_px: expected shape ({len(measured)}, 2) or {measured.shape}, got {moved.shape}"
-        )
+    check_shape("displacement_px", moved, (len(measured), 2), measured.shape)
     moved = moved - moved.mean(axis=0)
     square = (moved**2).sum(axis=0)
     if np.any(square <= 0):

@@ -8,7 +8,7 @@ from typing import Any, TypedDict, Unpack
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from faintspot.base.checks import not_none, number_between, numbers_between, one_of, real_array
+from faintspot.base.checks import check_shape, not_none, number_between, numbers_between, one_of, real_array
 from faintspot.base.errors import InputError
 from faintspot.slopes.camera.calibration import Calibration
 from faintspot.slopes.estimators.noise import pixel_noise
@@ -244,8 +244,7 @@ def fit_spots(
 def frame_stack(frames: ArrayLike, layout: Layout, calibration: Calibration) -> Stack:
     """Return the windows of a frame or of frames as one stack, in photo-electrons."""
     raw = real_array("frames", frames, minimum_dimensions=2)
-    if raw.ndim > 3:
-        raise InputError(f"frames: expected (h, w) or (n, h, w), got shape {raw.shape}")
+    check_shape("frames", raw, ("h", "w"), ("n", "h", "w"))
     maps = layout.images(calibration.maps(layout.frame_shape))
     windows = layout.images(raw if raw.ndim == 3 else raw[None])
     return _stack(windows, maps, calibration, raw.dtype)
@@ -254,8 +253,7 @@ def frame_stack(frames: ArrayLike, layout: Layout, calibration: Calibration) -> 
 def image_stack(images: ArrayLike, calibration: Calibration) -> Stack:
     """Return images of single spots as a stack, in photo-electrons."""
     raw = real_array("images", images)
-    if raw.ndim != 3:
-        raise InputError(f"images: expected (n, ny, nx), got shape {raw.shape}")
+    check_shape("images", raw, ("n", "ny", "nx"))
     return _stack(raw[:, None], calibration.maps(raw.shape[1:])[:, None], calibration, raw.dtype)
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from faintspot.base.arrays import Floats
-from faintspot.base.checks import finite_array, not_none, number_between, numbers_between
+from faintspot.base.checks import check_shape, finite_array, not_none, number_between, numbers_between
 from faintspot.base.errors import InputError
 from faintspot.slopes.camera.calibration import Calibration
 from faintspot.slopes.estimators.sensor import PIXEL_BLUR_PX2
@@ -106,8 +106,7 @@ class MeanImages:
             As for the class.
         """
         new = MeanImages(images_e, slopes_px, frames=frames)
-        if new.images_e.shape != self.images_e.shape:
-            raise InputError(f"images_e: expected shape {self.images_e.shape}, got {new.images_e.shape}")
+        check_shape("images_e", new.images_e, self.images_e.shape)
         frames = not_none(new.frames)
         part = max(
             frames / (not_none(self.frames) + frames), 1.0 - np.exp(-frames / self.time_constant_frames)

@@ -14,7 +14,7 @@ import numpy as np
 from scipy import sparse
 
 from faintspot.base.arrays import Floats
-from faintspot.base.checks import numbers_between, one_of
+from faintspot.base.checks import check_shape, numbers_between, one_of
 from faintspot.base.errors import InputError
 from faintspot.base.files import read_arrays, save_arrays, write_atomically
 from faintspot.io.fits_units import write_images
@@ -283,8 +283,7 @@ def _checked(arrays: Mapping[str, object], plant: LoopPlant) -> dict[str, Floats
         layers = len(numbers["first"]) if numbers["first"].ndim == 3 else 1
         shapes |= {**dict.fromkeys(_LAYERS, (layers, slopes, slopes)), "covariance_xy_px2": (slopes // 2,)}
     for name, array in numbers.items():
-        if array.shape != shapes.get(name, ()):
-            raise InputError(f"{name}: expected shape {shapes.get(name, ())}, got {array.shape}")
+        check_shape(name, array, shapes.get(name, ()))
     return numbers
 
 

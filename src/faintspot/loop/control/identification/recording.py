@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from faintspot.base.arrays import Floats
 from faintspot.base.checks import (
+    check_shape,
     finite_array,
     increasing,
     number_between,
@@ -202,8 +203,8 @@ class Recording(LoopSystem, LoopFrames):
         if self.commands is not None:
             shapes |= {"flat_command": self.commands.shape[1:]}
         for name, shape in shapes.items():
-            if getattr(self, name) is not None and getattr(self, name).shape != shape:
-                raise InputError(f"{name}: expected shape {shape}, got {getattr(self, name).shape}")
+            if getattr(self, name) is not None:
+                check_shape(name, getattr(self, name), shape)
         if self.commands is None or self.interaction_matrix is None:
             return
         expected, shape = (slopes, self.commands.shape[1]), self.interaction_matrix.shape

@@ -7,7 +7,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from faintspot.base.checks import finite_array, number_between, one_of, real_array
+from faintspot.base.checks import check_shape, finite_array, number_between, one_of, real_array
 from faintspot.base.errors import InputError
 from faintspot.slopes.sensor.detection.candidates import RATIOS, SMALLEST_PITCH_PX, Lattice, robust_std
 from faintspot.slopes.sensor.detection.few_spots import Stated, few_spots
@@ -228,15 +228,11 @@ def _too_few(count: int, lattice: Lattice, pupil: PupilRegion | None) -> str:
 def _checked(frame: object, bad_pixels: object) -> tuple[NDArray[np.generic], NDArray[np.bool_]]:
     """Return frame or frames and a mask of bad pixels, where the frame may be NaN."""
     frames = real_array("frame", frame, minimum_dimensions=2)
-    if frames.ndim > 3:
-        raise InputError(f"frame: expected (ny, nx) or (n_frames, ny, nx), got shape {frames.shape}")
+    check_shape("frame", frames, ("ny", "nx"), ("n_frames", "ny", "nx"))
     bad = np.zeros(frames.shape[-2:], dtype=bool)
     if bad_pixels is not None:
         bad = real_array("bad_pixels", bad_pixels) != 0
-        if bad.shape != frames.shape[-2:]:
-            raise InputError(
-                f"bad_pixels: expected shape {frames.shape[-2:]} like the frame, got {bad.shape}"
-            )
+        check_shape("bad_pixels", bad, frames.shape[-2:])
     return frames, bad
 
 
