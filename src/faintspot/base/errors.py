@@ -157,7 +157,8 @@ def lazy_names(package: str) -> tuple[Callable[[str], object], Callable[[], list
     The names are those that its source imports for type checkers, under `if TYPE_CHECKING`, each in a line
     of its own and as itself: modules of the package, and names from any module.
     """
-    source = Path(str(sys.modules[package].__file__)).read_text(encoding="utf-8")
+    loader: Any = getattr(sys.modules[package].__spec__, "loader", None)
+    source: str = loader.get_source(package)  # also from a zip file
     homes = {name: home for home, name in _FOR_TYPE_CHECKERS.findall(source)}
     names = sorted(homes)
 
