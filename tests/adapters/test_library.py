@@ -104,17 +104,14 @@ class TestRuntime:
 
 
 PARAMETERS = ["tv", "brightest", "thresholded", "window", "ml"]
-# A centroid has no step that thresholded ones lack. Those with parameters are measured with them.
-OTHERS = [
-    ("brightest", True),
-    *((name, False) for name in estimators() if name not in ("centroid", *PARAMETERS)),
-]
+# A centroid has no step that thresholded ones lack.
+ALL = [(name, False) for name in estimators() if name != "centroid"] + [("brightest", True)]
 
 
 @pytest.mark.slow
 @needs_compiler
 class TestBits:
-    @pytest.mark.parametrize(("estimator", "noise_map"), OTHERS)
+    @pytest.mark.parametrize(("estimator", "noise_map"), ALL)
     def test_frames_whole_and_by_groups(self, estimator: str, noise_map: bool) -> None:
         pipeline = pipeline_of(estimator, TARGETS[native_target()].width, noise_map=noise_map)
         library = exported(pipeline, f"{estimator}_{noise_map}")
@@ -336,6 +333,13 @@ class TestMemory:
         limits = {"ASAN_OPTIONS": "allocator_may_return_null=1"}  # for sizes that damage makes up
         out = run(program, library.bundle, number, tmp_path / "frames", 600, env=limits).stdout
         assert "allocations in frames: 0\n" in out
+
+    @pytest.mark.skipif(shutil.which("valgrind") is None, reason="no valgrind")
+    def test_valgrind(self, tmp_path: Path) -> None:
+        pipeline, library = brightest("memory")
+        frames_of(pipeline, "uint16")[-9:].tofile(tmp_path / "frames")
+        check = ("valgrind", "-q", "--error-exitcode=9", "--leak-check=full")
+        run(*check, self.built(tmp_path, library), library.bundle, 0, tmp_path / "frames", 60)
 
     @pytest.mark.skipif(shutil.which("nm") is None, reason="no nm")
     def test_nothing_but_libc_is_needed(self) -> None:
