@@ -127,6 +127,8 @@ def test_a_process_dies(tmp_path: Path) -> None:
     assert values(run_units(die_once, units, {}, WorkerPool(2))) == [0, 2, 4, 6]
 
 
+# A thread of loky may look for a unit that the interruption has taken away.
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
 @with_processes
 def test_interruption_does_not_wait_for_units() -> None:
     store: dict[str, Any] = {}

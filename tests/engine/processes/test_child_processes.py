@@ -125,6 +125,17 @@ def test_priority_holds_for_threads_that_were_there_before_and_is_given_back() -
         thread.join()
 
 
+def test_a_thread_that_ends_while_it_is_looked_at(monkeypatch: pytest.MonkeyPatch) -> None:
+    ended = threading.Thread(target=int)
+    ended.start()
+    ended.join()
+    assert ended.native_id is not None
+    threads = [threading.get_native_id(), ended.native_id]
+    monkeypatch.setattr("faintspot.engine.processes.child_processes._threads", lambda: threads)
+    with real_time() as refused:
+        assert refused == []
+
+
 def test_the_lowest_priority() -> None:
     code = (
         "import os; from faintspot.engine.processes.child_processes import low_priority; low_priority();"

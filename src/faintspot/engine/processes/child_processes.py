@@ -6,7 +6,6 @@ import os
 import signal
 import subprocess
 import sys
-import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
@@ -191,7 +190,10 @@ def real_time(cpus: Sequence[int] | None = None, priority: int = 0) -> Iterator[
     """
     refused: list[str] = []
     before = os.sched_getaffinity(0) if cpus else None
-    policies = {thread: (os.sched_getscheduler(thread), os.sched_getparam(thread)) for thread in _threads()}
+    usual, policies = (os.sched_getscheduler(0), os.sched_getparam(0)), {}
+    for thread in _threads():
+        with suppress(ProcessLookupError):  # it has ended
+            policies[thread] = os.sched_getscheduler(thread), os.sched_getparam(thread)
     if cpus:
         try:
             os.sched_setaffinity(0, cpus)
@@ -200,7 +202,7 @@ def real_time(cpus: Sequence[int] | None = None, priority: int = 0) -> Iterator[
     if priority:
         try:
             for thread in _threads():
-                with suppress(ProcessLookupError):  # it has ended
+                with suppress(ProcessLookupError):
                     os.sched_setscheduler(thread, os.SCHED_FIFO, os.sched_param(priority))
         except OSError as error:
             refused.append(f"real-time priority {priority}: {error.strerror}")
@@ -221,7 +223,7 @@ def real_time(cpus: Sequence[int] | None = None, priority: int = 0) -> Iterator[
             ctypes.CDLL(None).munlockall()
             for thread in _threads():
                 with suppress(ProcessLookupError):
-                    os.sched_setscheduler(thread, *policies.get(thread, policies[threading.get_native_id()]))
+                    os.sched_setscheduler(thread, *policies.get(thread, usual))
         if before is not None:
             os.sched_setaffinity(0, before)
 
