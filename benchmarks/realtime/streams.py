@@ -35,12 +35,17 @@ from benchmarks.realtime.realtime_processes import CONFIGURATION, SMALL, USUAL
 from faintspot.adapters.library.folder import export_library
 from faintspot.adapters.library.objects import native_target
 from faintspot.engine.processes.requests import request, socket_path
-from faintspot.slopes.pipeline.configuration import Configuration
 from faintspot.slopes.simulate import Detector, sensor_frames
 
 FRAMES = int(os.environ.get("FAINTSPOT_STREAMS_FRAMES", "100000"))
 AWAY_US = 10.0
-_STATUS = {"median us": "p50_us", "99 % us": "p99_us", "99.9 % us": "p99_9_us", "largest us": "max_us"}
+_LEVELS = {
+    "median us": (0.5, "p50_us"),
+    "99 % us": (0.99, "p99_us"),
+    "99.9 % us": (0.999, "p99_9_us"),
+    "largest us": (1.0, "max_us"),
+}
+"""Columns: levels of the latencies, and their names in the engine's status."""
 _HERE = Path(__file__).parent
 _EXAMPLES = _HERE.parents[1] / "examples" / "library"
 _SIMULATED, _FLUX_E = 100, 200.0
@@ -72,11 +77,10 @@ def _prepared(folder: Path) -> tuple[Path, tuple[int, int]]:
     """Write configuration and frames, and build the programs; return the bundle and the frames' shape."""
     path = folder / "faintspot.toml"
     path.write_text(f"{CONFIGURATION.format(**SMALL, **USUAL)}dark = {DARK_ADU}\n", encoding="utf-8")
-    described, detector = Configuration(path), Detector(1.0, offset_adu=DARK_ADU, bits=16)
-    layout, rng = described.layout, np.random.default_rng(1)
+    pipeline, detector = fs.SlopePipeline.from_file(path), Detector(1.0, offset_adu=DARK_ADU, bits=16)
+    layout, rng = pipeline.layout, np.random.default_rng(1)
     frames, _ = sensor_frames(layout, _SIMULATED, flux_e=_FLUX_E, detector=detector, rng=rng)
     frames.astype(np.uint16).tofile(folder / "frames.raw")
-    pipeline = fs.SlopePipeline(layout, described.settings, described.calibration)
     bundle = export_library(pipeline, KERNELS.resolve(), "streams", cpus=[native_target()]).bundle
     library = bundle.parent
     compiler = ["cc", "-O2", f"-I{library}", f"-I{_EXAMPLES}"]
@@ -91,8 +95,7 @@ def _row(name: str, times: NDArray[np.int64]) -> Row:
     sent, seen, stamp, away = times[times[:, 1] > 0].T
     was_away = away > 1e3 * AWAY_US
     latencies_us = (np.where(was_away, stamp, seen) - sent) / 1e3
-    levels = {"median us": 0.5, "99 % us": 0.99, "99.9 % us": 0.999, "largest us": 1.0}
-    values = {key: float(np.quantile(latencies_us, level)) for key, level in levels.items()}
+    values = {key: float(np.quantile(latencies_us, level)) for key, (level, _) in _LEVELS.items()}
     values |= {"frames": len(times), "lost": len(times) - len(sent)}
     values["feeder away"] = int(np.sum(was_away))
     return Row(name, values, better="lower")
@@ -125,7 +128,7 @@ def _rows(folder: Path) -> Iterator[Row]:
         (folder / "wfs.im.shm").unlink()
         yield _row(title, np.fromfile(folder / "times", np.int64).reshape(-1, 4))
         if own is not None:
-            its = {column: own["latency"][key] for column, key in _STATUS.items()}
+            its = {column: own["latency"][key] for column, (_, key) in _LEVELS.items()}
             yield Row("engine alone", its, better="lower")
 
 

@@ -77,6 +77,8 @@ def check_shape(name: str, array: NDArray[Any], *shapes: tuple[int | str, ...]) 
     InputError
         If it has another one.
     """
+    if array.shape in shapes:  # at once, as of each frame
+        return
     for shape in shapes:
         pairs = zip(shape, array.shape, strict=False)
         if len(shape) == array.ndim and all(isinstance(n, str) or n == found for n, found in pairs):

@@ -157,9 +157,9 @@ def lazy_names(package: str) -> tuple[Callable[[str], object], Callable[[], list
     The names are those that its source imports for type checkers, under `if TYPE_CHECKING`, each in a line
     of its own and as itself: modules of the package, and names from any module.
     """
-    loader: Any = getattr(sys.modules[package].__spec__, "loader", None)
-    source: str = loader.get_source(package)  # also from a zip file
-    homes = {name: home for home, name in _FOR_TYPE_CHECKERS.findall(source)}
+    module: Any = sys.modules[package]
+    source = module.__spec__.loader.get_data(module.__file__)  # also from a zip file
+    homes = {name: home for home, name in _FOR_TYPE_CHECKERS.findall(source.decode("utf-8"))}
     names = sorted(homes)
 
     def get(name: str) -> Any:
@@ -168,7 +168,7 @@ def lazy_names(package: str) -> tuple[Callable[[str], object], Callable[[], list
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
         is_module = homes[name] == package
         value = import_module(f"{package}.{name}") if is_module else getattr(import_module(homes[name]), name)
-        setattr(sys.modules[package], name, value)
+        setattr(module, name, value)
         return value
 
     return get, lambda: names, names

@@ -62,7 +62,7 @@ class FoundLayout:
 
     @property
     def doubts(self) -> tuple[str, ...]:
-        """What may be wrong with the layout, one sentence each."""
+        """Doubts about the layout, one sentence each."""
         doubts = [self.lenslets.doubt] if self.lenslets.doubt else []
         for reason, doubtful in (
             ("at their window's edge, which cuts them", self.clipped),

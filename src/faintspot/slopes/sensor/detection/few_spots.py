@@ -52,7 +52,7 @@ _QUARTERS = 0.5  # FWHM in pitches from which on four spots may be parts of one
 
 @dataclass(frozen=True)
 class Stated:
-    """What is known of the array; None where nothing is."""
+    """Known properties of the array; None: not known."""
 
     geometries: tuple[str, ...]
     pitch_px: float | None = None
