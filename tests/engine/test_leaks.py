@@ -24,8 +24,8 @@ from faintspot.engine.settings.estimators import EstimatorTrial
 pytestmark = pytest.mark.slow
 
 TIMES = int(os.environ.get("FAINTSPOT_LEAK_TIMES", "1"))
-FEW = 20 * TIMES
-FIRST = 12  # changes before the count begins: everything is compiled, and the heap has its size
+FEW = 10 * TIMES
+ROUNDS = 4  # in the first, code is compiled and the heap takes its size
 
 
 def held() -> dict[str, int]:
@@ -63,20 +63,23 @@ class Changing(Closing):
         self.bench.attached()
 
     def left_behind(self, change: Callable[[int], None], count: int) -> dict[str, int]:
-        """Make changes, and return how much more is held than after the first ones."""
-        for number in range(FIRST):
-            change(number)
-            self.send()
+        """Make changes in rounds, and return how much more is held after the round that left least.
+
+        A leak grows in every round, the heap of a thread or a table that doubles in one.
+        """
         gc.collect()
         gc.freeze()
         gc.disable()
         try:
-            before = held()
-            for number in range(FIRST, FIRST + count):
-                change(number)
-                self.send()
-            wait_for(lambda: held()["threads"] <= before["threads"] + 1)
-            return {name: value - before[name] for name, value in held().items()}
+            grown = []
+            for first in range(0, ROUNDS * count, count):
+                before = held()
+                for number in range(first, first + count):
+                    change(number)
+                    self.send()
+                wait_for(lambda before=before: held()["threads"] <= before["threads"] + 1)
+                grown.append({name: value - before[name] for name, value in held().items()})
+            return {name: min(each[name] for each in grown) for name in grown[0]}
         finally:
             gc.enable()
             gc.unfreeze()
@@ -86,8 +89,8 @@ class Changing(Closing):
 
 
 def assert_nothing(left: dict[str, int], count: int, bytes_each: int) -> None:
-    """A megabyte is the heap's own; the module that runs last may be between two threads."""
-    assert left["bytes"] < 2**20 + bytes_each * count, left
+    """A quarter of a megabyte is the heap's own; the module that runs last may be between two threads."""
+    assert left["bytes"] < 2**18 + bytes_each * count, left
     assert left["threads"] <= 1, left
     assert left["descriptors"] <= 2, left
     assert left["imported"] <= 3, left
@@ -112,14 +115,14 @@ def test_nothing_is_left_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
         def swap(number: int) -> None:
             estimators.load(str(write(tmp_path, f"return sensor.zero + {number % 7} / 10")), replace=True)
 
-        assert_nothing(changing.left_behind(lambda number: None, 1000), 0, 0)
-        count = 200 * TIMES
+        assert_nothing(changing.left_behind(lambda number: None, 300), 0, 0)
+        count = 60 * TIMES
         assert_nothing(changing.left_behind(change_settings, count), min(count, 1000), 2000)
-        assert live.change_number >= count
+        assert live.change_number >= ROUNDS * count
         estimators.load(str(write(tmp_path, "return sensor.zero")))
         live.propose({"estimator": "mine"})
         assert_nothing(changing.left_behind(swap, FEW), FEW, 1000)
         assert estimators.fault is None
         estimators.unload("mine")
         assert_nothing(changing.left_behind(lambda number: changing.restart_camera(), FEW), FEW, 1000)
-        assert engine.counters.source_restarts >= FEW
+        assert engine.counters.source_restarts >= ROUNDS * FEW
