@@ -1,6 +1,7 @@
-"""Refusals: errors of one line that name what was wrong."""
+"""Refusals: errors of one line that name what was wrong, one by one and in tables."""
 
 import math
+import re
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -19,6 +20,35 @@ def refused(*words: str, match: str | None = None) -> Iterator[None]:
     assert "\n" not in message
     for word in words:
         assert word in message, message
+
+
+def refusal(call: Callable[[], object]) -> str:
+    """Return the message with which a call refuses, which is empty where it does not."""
+    try:
+        call()
+    except InputError as error:
+        return str(error)
+    return ""
+
+
+def assert_all_refused(rows: Iterable[tuple[Any, tuple[str, ...]]], refusal: Callable[[Any], str]) -> None:
+    """Expect that what is given in each row is refused: in one line that has the row's names and values.
+
+    Besides those, the line has words: what was expected, or what to do. All rows that fail are reported.
+    """
+    faults = []
+    for given, names in rows:
+        try:
+            message = rest = refusal(given)
+        except Exception as error:
+            faults.append(f"{given!r:.120}: {type(error).__name__} {error}")
+            continue
+        for name in sorted(names, key=len, reverse=True):
+            rest = rest.replace(name, "")
+        says_more = len(re.findall(r"[A-Za-z]{2,}", rest)) > 1
+        if "\n" in message or not says_more or any(name not in message for name in names):
+            faults.append(f"{given!r:.120}: expected a line with {names} and what to do, got {message!r}")
+    assert not faults, "\n".join(faults)
 
 
 def assert_each_refused(call: Callable[..., Any], **values: Iterable[Any]) -> None:

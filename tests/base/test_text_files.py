@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tests.refusals import refused
 
 import faintspot
 from faintspot.base import text_files
@@ -15,36 +16,13 @@ from faintspot.base.errors import InputError
 from faintspot.base.text_files import parse_json, plain_values, to_json
 
 
-def refused(path: Path, content: bytes | None, if_missing: str = "") -> str:
-    if content is not None:
-        path.write_bytes(content)
-    with pytest.raises(InputError) as error:
-        text_files.parse_file(path, if_missing=if_missing)
-    assert str(error.value).startswith(f"{path}: ")
-    assert "\n" not in str(error.value)
-    return str(error.value).removeprefix(f"{path}: ")
-
-
 def test_a_file_gives_its_tables(tmp_path: Path) -> None:
     path = tmp_path / "a.toml"
     path.write_text('# a comment\n[table]\nname = "é"\n', encoding="utf-8")
     assert text_files.parse_file(path) == {"table": {"name": "é"}}
-
-
-def test_files_that_cannot_be_read(tmp_path: Path) -> None:
-    path = tmp_path / "a.toml"
-    assert refused(path, None) == "no such file"
-    assert refused(path, None, "`make demo` makes one") == "no such file; `make demo` makes one"
-    assert refused(path, b"\xff\xfe") == "not a TOML file: it is not UTF-8 text"
-    assert refused(path, b"a = 1\nb = [1,,2]") == "not a TOML file: Invalid value (at line 2, column 8)"
-    for content in (b"a = 2020-13-45", b"a = " + b"[" * 5000, b"a = " + b"9" * 5000):
-        assert refused(path, content).startswith("not a TOML file: ")
-    assert refused(tmp_path, None) == "cannot be read (Is a directory)"
-
-
-def test_files_that_are_too_large(tmp_path: Path) -> None:
-    corners = b"corners = [" + b"[1, 2]," * 10**6 + b"]"
-    assert "expected a TOML file of at most" in refused(tmp_path / "a.toml", corners)
+    path.unlink()
+    with refused(f"{path}", "`make demo`"):
+        text_files.parse_file(path, if_missing="`make demo` makes one")
 
 
 @pytest.mark.parametrize(

@@ -46,13 +46,6 @@ def test_demo_writes_files_and_repeats(folder: Path, run: Commands, monkeypatch:
     assert (made / "report.html").read_text(encoding="utf-8") == "second"
 
 
-def test_demo_refuses_wrong_options(folder: Path, run: Commands) -> None:
-    run.refused("demo", "--frames", 5, naming=("--frames", "5"))
-    run.refused("demo", "--seed", -1, naming=("--seed", "-1"))
-    run.refused("demo", "-o", "faintspot.toml", naming=("faintspot.toml", "folder"))
-    assert [path.name for path in folder.iterdir()] == ["faintspot.toml"]
-
-
 def test_a_gain_that_is_not_reached_is_said_in_words() -> None:
     def methods(error: float) -> list[Scored]:
         return [Scored(Settings("tv", noise_std=1.0), np.full(20, error / flux)) for flux in FLUXES_E]

@@ -38,21 +38,6 @@ def test_every_option_says_what_it_is_for(run: Commands) -> None:
 
 
 @pytest.mark.parametrize(
-    ("arguments", "naming"),
-    [
-        (["layuot"], ("layuot", "'layout'")),
-        (["nix"], ("nix", "faintspot --help")),
-        (["--nix"], ("--nix", "faintspot --help")),
-        (["layout", "a.fits", "--nix"], ("--nix", "faintspot layout --help")),
-        (["layout", "a.fits", "--geometry", "round"], ("--geometry", "round", "hexagonal")),
-        (["report"], ("SLOPES", "faintspot report --help")),
-    ],
-)
-def test_what_is_unknown(run: Commands, arguments: list[str], naming: tuple[str, ...]) -> None:
-    run.refused(*arguments, naming=naming)
-
-
-@pytest.mark.parametrize(
     ("error", "code", "text"),
     [(MemoryError(), 2, "error: not enough memory"), (KeyboardInterrupt(), 130, "interrupted")],
 )

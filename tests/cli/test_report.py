@@ -36,25 +36,3 @@ def test_one_and_two_methods(measured: Path, run: Commands) -> None:
     (measured / "a.npy").rename(measured / "b.npy")
     run.ok("report", "slopes.zarr", "-o", "with.html", "--recording", "b.npy")
     assert is_page(measured / "with.html")
-
-
-def test_what_cannot_be_reported(measured: Path, run: Commands) -> None:
-    (measured / "text.npz").write_text("nothing")
-    np.savez("frames.npz", frames=simulated())
-    (measured / "empty.zarr").mkdir()
-    before = (measured / "plain.npz").read_bytes()
-    for arguments, naming in {
-        "nix.zarr": ("nix.zarr", "no such file"),
-        "a.npy": ("a.npy",),
-        ".": (".: ", "Zarr store of slopes"),
-        "slopes.zarr plain.npz plain.npz": ("one file or two", "3"),
-        "text.npz": ("text.npz", "slopes"),
-        "frames.npz": ("frames.npz", "slopes"),
-        "empty.zarr": ("empty.zarr",),
-        "slopes.zarr --recording nix.npy": ("nix.npy",),
-        "slopes.zarr -o nix/page.html": ("nix/page.html", "does not exist"),
-        "plain.npz -o plain.npz": ("plain.npz", "page"),
-    }.items():
-        run.refused("report", *arguments.split(), naming=naming)
-    assert not list(measured.glob("*.html"))
-    assert (measured / "plain.npz").read_bytes() == before

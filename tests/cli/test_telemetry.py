@@ -12,7 +12,6 @@ pytest.importorskip("jinja2")
 pytest.importorskip("zarr")
 
 from tests.experiments.night.recorded_cases import BEGIN_S, write_recording
-from tests.io import loop_layouts
 from tests.loop.telemetry.alternation_cases import (
     MATRIX,
     PIXEL_ARCSEC,
@@ -24,20 +23,6 @@ from tests.loop.telemetry.alternation_cases import (
 from tests.loop.telemetry.loop_cases import recorded
 
 from faintspot.slopes.sensor.layout import Layout
-
-
-def test_a_question_at_a_time(folder: Path, run: Commands) -> None:
-    """Of a table each error names the option that answers it; the last ones are known from its file."""
-    pytest.importorskip("astropy")
-    loop = loop_layouts.random_loop()
-    loop_layouts.sparta(folder, loop._replace(slopes=loop.slopes[:, :12], matrix=loop.matrix[:12]))
-    given = ["telemetry", ".", "--output", "page.html"]
-    run.refused(*given, "--slopes", "Slopes", naming=("--slopes", "Gradients"))
-    run.refused(*given, "--slopes", "gradients", naming=("--slope-unit",))
-    given += ["--slope-unit", "px"]
-    run.refused(*given, naming=("--cells",))
-    given += ["--cells", "none", "--slope-order", "rows"]
-    run.refused(*given, naming=("slope_order", "pairs"))
 
 
 @pytest.mark.slow

@@ -128,25 +128,3 @@ def test_tune_learns_psf_from_frames(run: Commands) -> None:
     result = run.ok("tune", *arguments, "--flux-e", 150)
     assert "PSF learnt" in result.out
     assert len(SlopePipeline.from_file("faintspot.toml").layout) == 16
-
-
-@pytest.mark.parametrize(
-    ("arguments", "naming"),
-    [
-        (("tune",), ("read_noise_e", "--read-noise-e")),
-        (("tune", "--read-noise-e", "abc"), ("--read-noise-e",)),
-        (("tune", "--read-noise-e", -3, *KNOWN[2:]), ("read_noise_e = -3",)),
-        (("tune", *KNOWN[:-2]), ("magnitude", "flux_e")),
-        (("tune", *KNOWN, "--magnitude", 3), ("--magnitude", "both")),
-        (("tune", *KNOWN, "--budget", "3furlongs"), ("budget", "0.05arcsec")),
-        (("tune", *KNOWN[:-2], "--flux-e", "nan"), ("--flux-e", "finite")),
-        (("tune", *KNOWN[:-2], "--flux-e", "-3"), ("--flux-e", "above 0")),
-        (("tune", *KNOWN, "--config", "nothere.toml"), ("nothere.toml",)),
-        (("tune", *KNOWN, "--dark", "dark.fits"), ("--recording",)),
-        (("tune", *KNOWN, "-o", "nofolder/faintspot.toml"), ("nofolder",)),
-        (("tune", "--recording", "nothere.fits"), ("nothere.fits",)),
-    ],
-)
-def test_mistakes_are_named(run: Commands, arguments: tuple[object, ...], naming: tuple[str, ...]) -> None:
-    run.refused(*arguments, naming=naming)  # type: ignore[arg-type]
-    assert not Path("faintspot.toml").exists()

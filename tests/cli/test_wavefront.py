@@ -61,8 +61,6 @@ def test_drift_of_a_recording(run: Commands, slopes: Path, coarse_pictures: None
     np.testing.assert_allclose(written["drift"]["time"], np.array([0.5, 2.5, 4.5]) / 36)
     slope = np.polyfit(written["drift"]["time"], written["drift"]["mean"], 1)[0]
     np.testing.assert_allclose(written["drift"]["rate"], slope)
-    for bins in (0, 4):
-        run.refused("wavefront", slopes, "--drift", bins, naming=("bins", "3"))
 
 
 def test_unknown_values_are_null_with_a_reason(run: Commands, folder: Path, no_picture: None) -> None:
@@ -167,30 +165,6 @@ def test_displaced_source_is_a_tilt(run: Commands, slopes: Path, no_picture: Non
     Path("flat.npz").unlink()
     assert "flat.npz is taken as exact" in run.ok("wavefront", "relative.npz").out
     assert "not in these slopes" in run.ok("wavefront", "frames.npz").out
-
-
-def test_one_line_names_an_argument_that_cannot_be_used(run: Commands, slopes: Path) -> None:
-    text = CONFIGURATION.replace("[4, 4]", "[2, 2]")
-    assert text != CONFIGURATION
-    Path("other.toml").write_text(text)
-    np.save("other.npy", simulated(2)[:, :16, :16])
-    run.ok("slopes", "other.npy", "-c", "other.toml", "-o", "other.npz")
-    run.ok("slopes", "frames.npy", "-o", "slopes.csv")
-    np.save("mirror.npy", np.ones((6, 32)))
-    for arguments, naming in (
-        (("nothing.npz",), ("nothing.npz",)),
-        (("slopes.csv",), ("slopes.csv", "layout")),
-        ((slopes, "-o", "w.txt"), ("w.txt", ".json")),
-        ((slopes, "--modes", 30), ("modes = 30", "from 2 to 24")),
-        ((slopes, "--pixel-scale-arcsec", -1), ("pixel_scale_arcsec", "-1")),
-        ((slopes, "--minus", "nothing.npz"), ("nothing.npz",)),
-        ((slopes, "--minus", "other.npz"), ("other.npz", "16 sub-apertures", "same --config")),
-        ((slopes, "--stroke", 1), ("--actuators",)),
-        ((slopes, "--actuators", "mirror.npy"), ("mirror.npy", "(6, 32); transpose")),
-        ((slopes, "--actuators", "no.npy"), ("no.npy",)),
-        ((slopes, "--actuators", "mirror.npy", "--command", "c.txt"), ("c.txt", ".npy, .csv")),
-    ):
-        run.refused("wavefront", *arguments, naming=naming)
 
 
 @pytest.mark.slow

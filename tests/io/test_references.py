@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from tests.io.slope_files import ATTRIBUTES, begin, part, result, write
-from tests.refusals import refused
 
 from faintspot.io.slopes import read_reference
 
@@ -34,10 +33,6 @@ def test_where_nothing_is_valid(tmp_path: Path) -> None:
     expected = means()
     expected[3] = np.median(np.delete(expected, 3, axis=0), axis=0)
     np.testing.assert_allclose(read_reference(tmp_path / "a.npz"), expected, rtol=1e-12)
-    slopes["valid"][:] = False
-    write(tmp_path / "b.npz", slopes)
-    with refused("b.npz: expected valid slopes to take as reference, found none ("):
-        read_reference(tmp_path / "b.npz")
 
 
 def test_unfinished_store_gives_the_mean_so_far(tmp_path: Path) -> None:
@@ -60,18 +55,3 @@ def test_arrays_are_read_from_every_format(tmp_path: Path, name: str) -> None:
     else:
         np.save(path, array)
     np.testing.assert_array_equal(read_reference(tmp_path / name), array)
-
-
-@pytest.mark.parametrize("name", ["a" * 5000, "a\0b", "a\0b:frames"])
-def test_names_that_no_file_can_have(name: str) -> None:
-    with refused("no such file"):
-        read_reference(name)
-
-
-def test_a_damaged_archive(tmp_path: Path) -> None:
-    path = tmp_path / "flat.npz"
-    write(path, result())
-    content = path.read_bytes()
-    path.write_bytes(content.replace(b"PK\x01\x02", b"PK\x01\x03"))  # the list of what is in it
-    with refused("flat.npz"):
-        read_reference(path)

@@ -76,10 +76,3 @@ def test_stated_grid_is_binned(folder: Path, run: Commands) -> None:
     assert rise == pytest.approx(3.0, abs=0.05)
     assert valid == 1
     assert Layout.load("new.toml").window == (80, 80)
-
-
-def test_windows_are_whole_blocks(folder: Path, run: Commands) -> None:
-    np.save("first.npy", frames_of(120, 3, 40.0, 2.0, 5000.0, 0.0)[0])
-    run.refused(
-        "layout", "first.npy", "--bin", 2, "--pixels", 31, "-o", "new.toml", naming=("--pixels", "bin = 2")
-    )

@@ -38,9 +38,6 @@ def test_quad_cells_are_measured_by_their_halves(folder: Path, run: Commands) ->
     halves = images.sum(axis=-2)
     expected = 0.5 * (halves[..., 1] - halves[..., 0]) / images.sum(axis=(-2, -1))
     np.testing.assert_allclose(read_slopes("slopes.zarr").variables["x"], expected, atol=1e-5)
-    camera = ("--read-noise-e", "2", "--pixels", "2", "--fwhm-px", "1.8", "--flux-e", "300")
-    for given in (("--recording", "a.npy", "--config", "new.toml"), camera):  # there is nothing to tune
-        run.refused("tune", *given, "-o", "o.toml", naming=("quad cells",))
 
 
 def test_a_larger_grid_has_the_usual_settings(folder: Path, run: Commands) -> None:
@@ -53,20 +50,3 @@ def test_a_larger_grid_has_the_usual_settings(folder: Path, run: Commands) -> No
 def test_windows_that_are_smaller_than_the_pitch_are_said(folder: Path, run: Commands) -> None:
     np.save("a.npy", np.random.default_rng(1).normal(100, 1, (262, 262)))
     assert "of a pitch of 131 px" in run.ok("layout", "a.npy", "--grid", "2x2", "-o", "new.toml").out
-
-
-@pytest.mark.parametrize(
-    ("options", "naming"),
-    [
-        (("--grid", "8"), "--grid 8"),
-        (("--grid", "8x8", "--pitch-px", "2"), "--pitch-px"),
-        (("--grid", "80x8"), "cells of at least"),
-        (("--grid", "8x8", "--pixels", "3"), "within a cell"),
-        (("--grid", "8x8", "--roi", "0,0,300,20"), "roi = 0, 0, 300, 20"),
-        (("--grid", "8x8", "--pupil", "-90,0,3"), "no cell is illuminated"),
-        (("--grid", "8x8", "--illuminated-fraction", "2"), "--illuminated-fraction"),
-    ],
-)
-def test_grids_that_do_not_fit(folder: Path, run: Commands, options: tuple[str, ...], naming: str) -> None:
-    save_frames()
-    run.refused("layout", "a.npy", *options, "-o", "o.toml", naming=(naming,))

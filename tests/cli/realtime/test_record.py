@@ -53,14 +53,6 @@ def test_record_and_export(engine: Engine, tmp_path: Path, run: Commands) -> Non
     assert aotpy.AOSystem.read_from_file(file).ao_mode == "GLAO"
 
 
-def test_what_cannot_be_done_is_said(engine: Engine, tmp_path: Path, run: Commands) -> None:
-    name, store = engine.ring.name, tmp_path / "a.zarr"
-    run.refused("realtime", "record", tmp_path / "night", "--name", name, naming=("ends in .zarr",))
-    run.refused("realtime", "record", store, "--name", f"{name}-other", naming=("start the engine first",))
-    run.refused("export", "telemetry", store, "-o", tmp_path / "b", naming=("ends in .fits",))
-    run.refused("export", "telemetry", store, naming=("no such file",))
-
-
 def test_options_are_passed_on(run: Commands, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     layout, settings = Layout.grid((3, 3), pixels=8), Settings("brightest")
     taken: list[tuple[EngineOptions, dict[str, Any]]] = []

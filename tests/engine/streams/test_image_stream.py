@@ -274,15 +274,3 @@ def test_command_both_ways(folder: Path, name: str) -> None:
     assert not (folder / "cam_slopes.im.shm").exists()
     with refused("slopes", "isio:NAME"):
         StreamOut(f"{name}_slopes", "slopes")
-
-
-def test_bridge_refuses_wrong_arguments() -> None:
-    from faintspot.cli.realtime.sources import bridge
-
-    for arguments, naming in (
-        ([], "expected a stream of frames, --to or --commands"),
-        (["--to", "isio:b", "--frames", "3"], "--frames"),
-        (["--to", "b"], "expected isio:NAME"),
-    ):
-        with refused(naming):
-            bridge.main(arguments, standalone_mode=False)

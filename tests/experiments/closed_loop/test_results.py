@@ -55,15 +55,6 @@ def test_magnitude_is_read_as_written(tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir()] == [MAGNITUDE_FILE]
 
 
-def test_other_files_are_refused(tmp_path: Path) -> None:
-    path = tmp_path / "x.npz"
-    with refused("no such file"):
-        MagnitudeResult.load(path)
-    path.write_bytes(b"nothing")
-    with refused("expected a magnitude experiment"):
-        MagnitudeResult.load(path)
-
-
 def test_folders_that_cannot_be(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="does not exist: create it first"):
         make_folder(tmp_path / "a" / "b")

@@ -83,22 +83,6 @@ def test_a_primary_image_of_one_number_is_not_the_frames(tmp_path: Path) -> None
     assert read_array(tmp_path / "b.fits").shape == (1,)
 
 
-def test_no_such_extension_no_image_no_fits(tmp_path: Path) -> None:
-    path = save(tmp_path / "a.fits", cube())
-    with refused("'SCI'", "PRIMARY"):
-        open_frames([path], key="SCI")
-    table = fits.BinTableHDU.from_columns([fits.Column("a", "E", array=np.zeros(3))], name="TAB")
-    fits.HDUList([fits.PrimaryHDU(), table]).writeto(tmp_path / "t.fits")
-    for key in (None, "TAB"):
-        with refused("t.fits", "image"):
-            open_frames([tmp_path / "t.fits"], key=key)
-    (tmp_path / "b.fits").write_bytes(b"SIMPLE  but no header" * 300)
-    (tmp_path / "c.fits.gz").write_bytes(gzip.compress(b"no header" * 300))
-    for name in ("b.fits", "c.fits.gz"):
-        with refused(name, "FITS"):
-            open_frames([tmp_path / name])
-
-
 @pytest.mark.parametrize("kept", [0.5, 1.0])
 def test_truncated_gzip_keeps_the_frames_before(tmp_path: Path, kept: float) -> None:
     """Either the frames are cut, or only the checksum at the end."""

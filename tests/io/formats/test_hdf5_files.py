@@ -30,26 +30,6 @@ def test_variables_and_fields(tmp_path: Path, compressed: bool) -> None:
         np.testing.assert_array_equal(stored, values)
         assert stored.dtype == values.dtype
     assert {"RX", "NREC", "A.DMCOMMAND"} <= set(hdf5_files.Idl().names(path))
-    with refused("A.DMCOMMAND", "choose one with trs.sav:NAME"):
-        read_array(path)
-    with refused("no array 'A.NONE'"):
-        read_array(f"{path}:A.NONE")
-
-
-@pytest.mark.parametrize("kept", [2, 4, 30, 200, -17, -5])
-def test_truncated_idl_file_is_refused(tmp_path: Path, kept: int) -> None:
-    path = idl_file.write(tmp_path / "trs.sav", {"rx": GAIN, "A": FIELDS})
-    path.write_bytes(path.read_bytes()[:kept])
-    with refused("trs.sav"):
-        read_array(f"{path}:RX")
-
-
-def test_records_in_a_circle(tmp_path: Path) -> None:
-    """SciPy would follow them without an end."""
-    path = tmp_path / "trs.sav"
-    path.write_bytes(b"SR\0\4" + struct.pack(">iIII", 19, 4, 0, 0))
-    with refused("its record at byte 4 does not end"):
-        read_array(f"{path}:RX")
 
 
 def test_idl_records_that_inflate_too_far(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

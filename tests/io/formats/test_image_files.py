@@ -5,8 +5,7 @@ import numpy as np
 import pytest
 from numpy.typing import DTypeLike
 from PIL import Image
-from tests.io.frame_files import cube, save, tifffile
-from tests.refusals import refused
+from tests.io.frame_files import cube, tifffile
 
 from faintspot.io import open_frames, read_array
 
@@ -35,21 +34,8 @@ def test_pages_of_several_sizes(tmp_path: Path) -> None:
     with tifffile.TiffWriter(tmp_path / "a.tif") as writer:
         writer.write(cube(), photometric="minisblack")
         writer.write(cube(1, 3, 4)[0])
-    with refused("pages of one size", "0: 11 x 6 x 8 int16, 1: 3 x 4 int16", "a.tif:NUMBER"):
-        open_frames([tmp_path / "a.tif"])
     np.testing.assert_array_equal(read_array(f"{tmp_path / 'a.tif'}:1"), cube(1, 3, 4)[0])
     np.testing.assert_array_equal(read_array(f"{tmp_path / 'a.tif'}:0"), cube())
-    for key in ("2", "frames"):
-        with refused(f"no pages {key!r}", "0: 11 x 6 x 8"):
-            open_frames([tmp_path / "a.tif"], key=key)
-
-
-def test_tiff_of_five_channels_is_refused(tmp_path: Path) -> None:
-    tifffile.imwrite(
-        tmp_path / "a.tif", np.zeros((6, 8, 5), np.uint8), photometric="minisblack", planarconfig=1
-    )
-    with refused("a.tif: expected grey frames", "(6, 8, 5)"):
-        open_frames([tmp_path / "a.tif"])
 
 
 @pytest.mark.parametrize("compression", ["tiff_lzw", "packbits"])
@@ -68,16 +54,3 @@ def test_tiff_that_pillow_decodes(
         assert source.dtype == kind
         np.testing.assert_array_equal(source.block(0, 11), frames)
         np.testing.assert_array_equal(source.block(7, 8), frames[7:8])
-
-
-def test_pages_in_a_circle_are_refused(tmp_path: Path) -> None:
-    """The last page states that the first is next."""
-    path = save(tmp_path / "pages.tif", cube(3))
-    with tifffile.TiffFile(path) as file:
-        first, last = file.pages[0].offset, file.pages[2].offset
-        link = last + 2 + 12 * len(file.pages[2].tags)
-    content = bytearray(path.read_bytes())
-    content[link : link + 4] = first.to_bytes(4, "little")
-    path.write_bytes(content)
-    with refused("pages.tif", "circular"):
-        open_frames([path])

@@ -12,20 +12,6 @@ from tests.refusals import refused
 from faintspot.io import open_frames, read_array
 
 
-def test_numbers_in_other_files_are_not_read(tmp_path: Path) -> None:
-    with h5py.File(tmp_path / "a.h5", "w") as file:
-        layout = h5py.VirtualLayout((2, 4, 4), "u1")
-        layout[0] = h5py.VirtualSource("/dev/zero", "x", (4, 4))
-        file.create_virtual_dataset("virtual", layout)
-        file.create_dataset("external", (2, 4, 4), "u1", external=[("/dev/zero", 0, h5py.h5f.UNLIMITED)])
-        file["link"] = h5py.ExternalLink("other.h5", "frames")
-    for name in ("virtual", "external"):
-        with refused("stored in other files"):
-            open_frames([f"{tmp_path}/a.h5:{name}"])
-    with refused("no array 'link'"):
-        open_frames([f"{tmp_path}/a.h5:link"])
-
-
 class TestMatlab:
     @pytest.mark.parametrize("name", ["mat", "7.3.mat"])
     def test_matrices_are_as_matlab_has_them(self, tmp_path: Path, name: str) -> None:
@@ -86,15 +72,3 @@ class TestImages:
         tifffile.imwrite(tmp_path / "a.tif", np.repeat(frames[..., None], 3, axis=-1), photometric="rgb")
         with open_frames([tmp_path / "a.tif"]) as source:
             np.testing.assert_array_equal(source.block(0, 3), frames)
-
-    def test_png_files_that_are_not_grey_are_refused(self, tmp_path: Path) -> None:
-        path = tmp_path / "a.png"
-        Image.fromarray(np.zeros((6, 8, 3), np.uint8)).convert("P").save(path)
-        with refused("expected a grey image of 8 or 16 bits, got mode P"):
-            open_frames([path])
-        Image.fromarray(cube(1, 60, 80)[0].astype("u1")).save(path)
-        with refused("one unnamed"):
-            open_frames([path], key="frames")
-        path.write_bytes(path.read_bytes()[:200])
-        with refused("a.png: ", "damaged"), open_frames([path]) as source:
-            source.block(0, 1)

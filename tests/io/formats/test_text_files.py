@@ -4,7 +4,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tests.refusals import refused
 
 from faintspot.io import read_array
 
@@ -25,16 +24,3 @@ def test_names_comments_and_empty_fields(tmp_path: Path) -> None:
     np.testing.assert_array_equal(read_array(path), [[1, np.nan, 3], [4, 5, np.nan]])
     path.write_text("\ufeff1 2\n")
     np.testing.assert_array_equal(read_array(path), [[1, 2]])
-
-
-@pytest.mark.parametrize(
-    "content", [b"", b"\n# nothing\n", b"a,b\n", b"1 2\n3\n", b"1,x\n2,3\n", b"\xff\xfe1,2\n"]
-)
-def test_no_rows_of_numbers(tmp_path: Path, content: bytes) -> None:
-    path = tmp_path / "a.txt"
-    path.write_bytes(content)
-    with refused("a.txt"):
-        read_array(path)
-    if content:
-        with refused("no name of an array"):
-            read_array(f"{path}:matrix")

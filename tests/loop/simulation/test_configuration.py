@@ -96,23 +96,6 @@ def test_impossible_values_are_refused_in_one_line(
         LoopConfiguration().replace(section, **values)
 
 
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("[telescop]", "telescop: unknown table; did you mean telescope?"),
-        ("[sensor]\npixel = 3", "sensor.pixel: unknown key; did you mean pixels?"),
-        ("sensor = 3", "expected a table"),
-        ("[sensor", "not a TOML file"),
-        ('name = ""', "name"),
-    ],
-)
-def test_bad_files_are_refused_in_one_line(tmp_path: Path, text: str, message: str) -> None:
-    path = tmp_path / "loop.toml"
-    path.write_text(text)
-    with refused(f"{path}: ", message):
-        load_loop(path)
-
-
 def test_a_missing_file_names_what_is_shipped() -> None:
     with pytest.raises(InputError, match=r"no such file.*canary"):
         load_loop("nothing.toml")

@@ -80,9 +80,3 @@ def test_the_report_has_the_paths(record: Recording) -> None:
     assert "largest valid displacement is 1." in text
     Path("frames.npy").unlink()
     assert "Not drawn: " in Page(report_of_stored(["s.npz"])).text
-
-
-def test_what_is_refused(record: Recording, run: Commands) -> None:
-    run.refused("slopes", "frames.npy", "--follow", "--mean-flux", naming=("--follow", "--mean-flux"))
-    Path("faintspot.toml").write_text(Path("faintspot.toml").read_text().replace("pitch_px", "# pitch_px"))
-    run.refused("slopes", "frames.npy", "--follow", naming=("faintspot.toml", "pitch_px"))

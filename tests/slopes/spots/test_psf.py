@@ -88,14 +88,8 @@ def test_saved_and_loaded(tmp_path: Path) -> None:
     assert PSF.load(tmp_path / "one.npz").index is None
 
 
-def test_files_that_are_no_psf(tmp_path: Path) -> None:
-    (tmp_path / "text.npz").write_text("no")
-    np.savez(tmp_path / "other.npz", a=1)
-    np.savez(tmp_path / "dark.npz", samples=np.zeros((7, 7)), oversampling=2)
-    for name in ("text.npz", "other.npz", "dark.npz", "absent.npz"):
-        with refused(name):
-            PSF.load(tmp_path / name)
-    with refused("cannot be written"):
+def test_files_that_cannot_be_written(tmp_path: Path) -> None:
+    with refused("psf.npz"):
         PSF.analytic(radius_px=4).save(tmp_path / "no" / "psf.npz")
 
 
