@@ -53,7 +53,6 @@ REFUSED: list[tuple[str, dict[str, Any]]] = [
     ("set", {"changes": {"search_range_px": np.nan}}),
     ("set", {"changes": {"search_range_px": 1}, "where": [N]}),
     ("set", {"changes": {"estimator": "ml", "search_range_px": 3.5}}),
-    ("set", {"changes": {}}),
     ("interleave", {"methods": "set,none"}),
     ("interleave", {"methods": "set", "every": 0}),
     ("interleave", {"methods": "set,search_range_px=-1"}),

@@ -123,8 +123,6 @@ def test_new_spots_are_measured_with_from_the_next_frame(bench: Bench, tmp_path:
     np.testing.assert_array_equal(engine.live.newest.pipelines[0](frame).vector, expected(frame).vector)
     engine._streams.close()
     engine._telemetry.close()
-    with refused("pipelines"):  # that are not made from files
-        commands_of(bench.engine)["spots"]({"spots": str(path)})
 
 
 def test_a_source_that_goes_and_comes_back(bench: Bench) -> None:

@@ -16,7 +16,7 @@ from click.testing import CliRunner
 from tests.engine.commands import needs_shared_memory, start
 from tests.loop.simulation.loop_cases import faint, plain
 from tests.patience import wait_for
-from tests.refusals import assert_each_refused, refused
+from tests.refusals import refused
 from tests.shared_data import skip_without
 
 from faintspot.base.errors import InputError
@@ -187,27 +187,13 @@ def test_magnitude_and_seeing_are_converted() -> None:
     assert now.r0_m == pytest.approx((0.1007, 0.2013), rel=1e-3)  # 0.976 x 500 nm / 1 arcsec
 
 
-def test_conditions_out_of_range_are_refused() -> None:
-    def ordered(**changes: Any) -> None:
-        ObservingConditions.of(CONFIGURATION).ordered(CONFIGURATION, {"wind_factor": 3.0, **changes})
-
-    assert_each_refused(ordered, photons=[-1, None], magnitude=["bright"], r0_m=[0, [0.1, 0.2, 0.3]])
-    for changes, text in (
-        ({"magnitude": -30}, "photons = "),
-        ({"photons": 1, "magnitude": 1}, "photons and magnitude"),
-        ({"phtons": 1}, "phtons: unknown order; did you mean photons"),
-    ):
-        with refused(text):
-            ordered(**changes)
-
-
 def test_commands_over_the_socket(watched: Sky, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     path = socket_path(name, TELESCOPE)
     with ControlServer(path, commands_of(watched.telescope)), watched.observing():
         reply = request(path, "set", changes={"photons": 50, "r0_m": [0.1, 0.2]}, timeout_s=PATIENCE_S)
         assert reply["frame"] is None or reply["frame"] >= 0
         assert reply["conditions"] == {"photons": 50, "r0_m": [0.1, 0.2], "wind_factor": 1}
-        with pytest.raises(InputError, match="changes: expected values by name"):
+        with refused("changes"):
             request(path, "set", changes=[])
         asked = ["--telescope", "--name", name]
         said = CliRunner().invoke(send, ["--telescope", "wind_factor=2", "--name", name])
@@ -219,9 +205,9 @@ def test_commands_over_the_socket(watched: Sky, name: str, monkeypatch: pytest.M
         status = json.loads(CliRunner().invoke(show_status, [*asked, "--json"]).output)
         assert tuple(status["truth"]) == TRUTH
     for command, options in ((send, ["photons=1"]), (show_status, [])):
-        refused = CliRunner().invoke(command, [*options, "--telescope", "--name", name])
-        assert isinstance(refused.exception, InputError)
-        assert "faintspot realtime telescope starts one" in str(refused.exception)
+        answer = CliRunner().invoke(command, [*options, "--telescope", "--name", name])
+        assert isinstance(answer.exception, InputError)
+        assert "faintspot realtime telescope" in str(answer.exception)
 
 
 # ---- pace, ends and restarts
@@ -229,7 +215,7 @@ def test_commands_over_the_socket(watched: Sky, name: str, monkeypatch: pytest.M
 
 def test_two_of_one_name_and_nothing_left_behind(watched: Sky, name: str) -> None:
     watched.frame()
-    with pytest.raises(InputError, match="already writes into this pixel ring"):
+    with refused(name):
         SimulatedTelescope(CONFIGURATION, name)
     watched.telescope.close()
     watched.telescope.close()
@@ -237,7 +223,7 @@ def test_two_of_one_name_and_nothing_left_behind(watched: Sky, name: str) -> Non
     assert not {f"{name}_truth", f"{name}_frames"} & set(pyshmem.list_streams())
     with SimulatedTelescope(CONFIGURATION, name) as again:
         assert again.run(1).frames == 1
-    with pytest.raises(InputError, match="rows_per_block"):
+    with refused("rows_per_block"):
         SimulatedTelescope(CONFIGURATION, name, rows_per_block=0)
     assert not (FOLDER / name).exists()
 

@@ -64,17 +64,6 @@ def test_methods_take_turns() -> None:
     assert [found.method_of(count) for count in range(8)] == [0, 0, 1, 1, 2, 2, 0, 0]
 
 
-def test_anything_else_is_refused() -> None:
-    nonsense = "", "tvv", "none,,tv", "strength=2", "noise_std=", "tv:", "kalmann", "tv+", "tv+none"
-    for text in (*nonsense, "tv+kalman+tv"):
-        with refused():
-            Interleaving.parse(text)
-    with refused("interleave: 'ml:2'", "no strength"):
-        Interleaving.parse("ml:2")
-    with refused("every = 0"):
-        Interleaving.parse("none,tv", 0)
-
-
 def test_methods_of_later_interleavings_have_numbers_of_their_own() -> None:
     changes: list[dict[str, Any]] = [
         {"changes": {"noise_std": 2.0}},
