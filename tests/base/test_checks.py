@@ -6,6 +6,7 @@ from tests.refusals import refused
 from tests.slopes.estimators.image_cases import BAD_IMAGES
 
 from faintspot.base import checks
+from faintspot.base.errors import InputError
 
 
 class TestRealArray:
@@ -105,6 +106,11 @@ class TestNumbers:
     def test_numbers_that_are_none_are_refused(self, bad: Any) -> None:
         with refused("value"):
             checks.number_between("value", bad)
+
+
+def test_errors_have_one_line() -> None:
+    error = InputError("two\nlines", name="a", value="b\nc", where="d\ne")
+    assert str(error) == "d e: a = 'b\\nc': two lines"
 
 
 def test_one_of_returns_known_values_and_refuses_others() -> None:

@@ -49,15 +49,18 @@ REQUESTS: list[tuple[str, Fields, tuple[str, ...]]] = [
     ("learnt", {}, ("found = None",)),
     ("learnt", {"found": "x", "model": "x"}, ("controller", "kalman")),
 ]
-METHODS = [
-    *(("", ()), ("tvv", ("'tvv'",)), ("none,,tv", ()), ("strength=2", ("strength",)), ("noise_std=", ())),
-    *(
-        ("tv:", ("noise_std=",)),
-        ("kalmann", ("'kalmann'",)),
-        ("tv+", ("NAME=VALUE",)),
-        ("tv+none", ("'none'",)),
-    ),
-    *(("tv+kalman+tv", ("'kalman'",)), ("ml:2", ("'ml:2'",))),
+METHODS: list[tuple[str, tuple[str, ...]]] = [
+    ("", ()),
+    ("tvv", ("'tvv'",)),
+    ("none,,tv", ()),
+    ("strength=2", ("strength",)),
+    ("noise_std=", ("noise_std=",)),
+    ("tv:", ("noise_std=",)),
+    ("kalmann", ("'kalmann'",)),
+    ("tv+", ("NAME=VALUE",)),
+    ("tv+none", ("'none'",)),
+    ("tv+kalman+tv", ("'kalman'",)),
+    ("ml:2", ("'ml:2'",)),
 ]
 NAMES = [(name, ("name",)) for name in ("", "a/b", "../x", ".x", "a b", "x" * 65, "é", None)]
 CONDITIONS: list[tuple[Fields, tuple[str, ...]]] = [
