@@ -11,6 +11,8 @@ import pytest
 import scipy.io
 from numpy.typing import NDArray
 
+from faintspot.io import open_frames
+
 fits = pytest.importorskip("astropy.io.fits")
 h5py: Any = pytest.importorskip("h5py")
 tifffile = pytest.importorskip("tifffile")
@@ -130,6 +132,16 @@ FRAME_FILES = {kind.ending: kind for kind in _KINDS}
 
 def cube(n: int = 11, height: int = 6, width: int = 8, dtype: str = "int16") -> NDArray[Any]:
     return np.random.default_rng(5).integers(-900, 900, (n, height, width)).astype(dtype)
+
+
+def assert_frames(location: str | Path, frames: NDArray[Any], **options: Any) -> str:
+    """Expect these frames, whole and in part, in the machine's order of bytes; return what is noted."""
+    with open_frames([location], **options) as source:
+        assert (source.n_frames, *source.shape) == frames.shape
+        assert source.dtype == frames.dtype.newbyteorder("=")
+        for start in (0, len(frames) // 2, len(frames) - 1):
+            np.testing.assert_array_equal(source.block(start, len(frames)), frames[start:])
+        return source.note
 
 
 def save(path: Path, frames: NDArray[Any]) -> Path:

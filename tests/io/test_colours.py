@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 import scipy.io
+from tests.io.frame_files import assert_frames
 from tests.refusals import refused
 
 from faintspot.io import open_frames, read_array
@@ -44,29 +45,23 @@ def test_a_colour_is_selected_by_its_name(tmp_path: Path, saved: np.ndarray, nam
     path = tmp_path / name
     SAVE[name](path, saved)
     for number, colour in enumerate(("red", "green", "blue")):
-        with open_frames([f"{path}:{colour}"]) as source:
-            assert (source.n_frames, *source.shape) == (5, 16, 24)
-            np.testing.assert_array_equal(source.block(1, 4), COLOURS[1:4, ..., number])
+        assert_frames(f"{path}:{colour}", COLOURS[..., number])
     with open_frames([path]) as source, refused(f"{name}", ":green"):
         source.block(0, 5)
-    with open_frames([path], key="blue") as source:
-        np.testing.assert_array_equal(source.block(0, 5), COLOURS[..., 2])
+    assert_frames(path, COLOURS[..., 2], key="blue")
 
 
 @pytest.mark.parametrize("name", SAVE)
 def test_equal_colours_are_grey(tmp_path: Path, saved: np.ndarray, name: str) -> None:
     axis = saved.shape.index(3)
     SAVE[name](tmp_path / name, saved.take([0, 0, 0], axis))
-    with open_frames([tmp_path / name]) as source:
-        np.testing.assert_array_equal(source.block(0, 5), COLOURS[..., 0])
-        assert "equal" in source.note
+    assert "equal" in assert_frames(tmp_path / name, COLOURS[..., 0])
 
 
 def test_a_colour_of_a_named_array(tmp_path: Path) -> None:
     path = tmp_path / "a.npz"
     np.savez(path, dark=np.zeros((16, 24)), flat=np.ones((16, 24)), images=COLOURS)
-    with open_frames([f"{path}:images:green"]) as source:
-        np.testing.assert_array_equal(source.block(0, 5), COLOURS[..., 1])
+    assert_frames(f"{path}:images:green", COLOURS[..., 1])
 
 
 def test_fits_files_whose_primary_has_no_image(tmp_path: Path) -> None:
@@ -80,11 +75,3 @@ def test_fits_files_whose_primary_has_no_image(tmp_path: Path) -> None:
         np.testing.assert_array_equal(source.block(0, 5), frames)
         assert source.description == f"{one}:SCI"
     np.testing.assert_array_equal(read_array(f"{two}:2"), frames[0])
-
-
-def test_each_colour_of_an_image_is_its_own(tmp_path: Path) -> None:
-    image = pytest.importorskip("PIL.Image")
-    image.fromarray(COLOURS[0]).save(tmp_path / "a.png")
-    for number, colour in enumerate(("red", "green", "blue")):
-        with open_frames([tmp_path / f"a.png:{colour}"]) as source:
-            np.testing.assert_array_equal(source.block(0, 1)[0], COLOURS[0, ..., number])

@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tests.io.frame_files import cube, fits, save
+from tests.io.frame_files import assert_frames, cube, fits, save
 from tests.refusals import refused
 
 from faintspot.io import open_frames, read_array
@@ -21,57 +21,47 @@ def written(path: Path, stored: Any, *cards: tuple[str, Any]) -> Path:
     return path
 
 
-class TestValues:
-    @pytest.mark.parametrize("name", ["a.fits", "a.fits.gz"])
-    def test_scale_and_zero_as_astropy_has_them(self, tmp_path: Path, name: str) -> None:
-        unit = fits.ImageHDU(cube(), name="SCI")
-        unit.data[1, 2, 3] = -999
-        unit.header["BSCALE"], unit.header["BZERO"], unit.header["BLANK"] = 0.5, 100.0, -999
-        units = fits.HDUList([fits.PrimaryHDU(), fits.ImageHDU(np.ones((2, 3)), name="DARK"), unit])
-        units.writeto(tmp_path / name)
-        with fits.open(tmp_path / name) as opened:
-            expected = np.array(opened["SCI"].data)
-        for location in (f"{tmp_path / name}:sci", f"{tmp_path / name}:2"):
-            with open_frames([location]) as source:
-                np.testing.assert_array_equal(source.block(0, 11), expected)
+@pytest.mark.parametrize("name", ["a.fits", "a.fits.gz"])
+def test_scale_and_zero_as_astropy_has_them(tmp_path: Path, name: str) -> None:
+    unit = fits.ImageHDU(cube(), name="SCI")
+    unit.data[1, 2, 3] = -999
+    unit.header["BSCALE"], unit.header["BZERO"], unit.header["BLANK"] = 0.5, 100.0, -999
+    units = fits.HDUList([fits.PrimaryHDU(), fits.ImageHDU(np.ones((2, 3)), name="DARK"), unit])
+    units.writeto(tmp_path / name)
+    with fits.open(tmp_path / name) as opened:
+        expected = np.array(opened["SCI"].data, np.float32)
+    for key in ("sci", "2"):
+        assert_frames(f"{tmp_path / name}:{key}", expected)
 
-    @pytest.mark.parametrize(
-        ("zero", "scale", "blank", "expected"),
-        [
-            (1.0, 2.0, -7, [[[3.0, np.nan], [7.0, 9.0]]]),
-            (0.0, 1.0, 1, [[[np.nan, -7.0], [3.0, 4.0]]]),
-            (32768.0, 1.0, 3, [[[32769.0, 32761.0], [np.nan, 32772.0]]]),
-        ],
-    )
-    @pytest.mark.parametrize("name", ["a.fits", "a.fits.gz"])
-    def test_blank_becomes_nan(
-        self, tmp_path: Path, name: str, zero: float, scale: float, blank: int, expected: Any
-    ) -> None:
-        stored = np.array([[[1, -7], [3, 4]]], np.int16)
+
+@pytest.mark.parametrize("name", ["a.fits", "a.fits.gz"])
+def test_blank_becomes_nan(tmp_path: Path, name: str) -> None:
+    stored = np.array([[[1, -7], [3, 4]]], np.int16)
+    for zero, scale, blank, expected in (
+        (1.0, 2.0, -7, [[[3.0, np.nan], [7.0, 9.0]]]),
+        (0.0, 1.0, 1, [[[np.nan, -7.0], [3.0, 4.0]]]),
+        (32768.0, 1.0, 3, [[[32769.0, 32761.0], [np.nan, 32772.0]]]),
+    ):
         path = written(tmp_path / name, stored, ("BSCALE", scale), ("BZERO", zero), ("BLANK", blank))
         assert read_array(path).dtype == np.float32
         np.testing.assert_array_equal(read_array(path), expected)
 
-    def test_blank_of_numbers_that_are_not_whole_means_nothing(self, tmp_path: Path) -> None:
-        frames = cube().astype(np.float32)
-        frames[1, 2, 3] = 3.0
-        path = written(tmp_path / "a.fits", frames, ("BLANK", 3))
-        np.testing.assert_array_equal(read_array(path), frames)
 
-    @pytest.mark.parametrize("ending", ["fits", "fits.fz"])
-    @pytest.mark.parametrize("dtype", ["int8", "uint16", "uint32", "uint64", "float64", "int64"])
-    def test_integers_of_the_other_sign_are_exact(self, tmp_path: Path, dtype: str, ending: str) -> None:
-        if ending == "fits.fz" and dtype.endswith("64"):
-            return  # the compression does not know these types
-        if dtype.startswith("f"):
-            values = np.linspace(-1, 1, 24).reshape(2, 3, 4)
-        else:
-            limits = np.iinfo(dtype)
-            extremes = [limits.min, limits.min + 1, limits.max, limits.max // 2]
-            values = np.array(extremes * 6, dtype).reshape(2, 3, 4)
-        stored = read_array(save(tmp_path / f"a.{ending}", values))
-        assert stored.dtype == values.dtype
-        np.testing.assert_array_equal(stored, values)
+def test_blank_of_numbers_that_are_not_whole_means_nothing(tmp_path: Path) -> None:
+    frames = cube().astype(np.float32)
+    frames[1, 2, 3] = 3.0
+    assert_frames(written(tmp_path / "a.fits", frames, ("BLANK", 3)), frames)
+
+
+@pytest.mark.parametrize("ending", ["fits", "fits.fz"])
+def test_integers_of_the_other_sign_are_exact(tmp_path: Path, ending: str) -> None:
+    for dtype in ("int8", "uint16", "uint32", *(("uint64", "int64") if ending == "fits" else ())):
+        limits = np.iinfo(dtype)  # the compression does not know integers of 64 bits
+        extremes = [limits.min, limits.min + 1, limits.max, limits.max // 2]
+        values = np.array(extremes * 6, dtype).reshape(2, 3, 4)
+        assert_frames(save(tmp_path / f"{dtype}.{ending}", values), values)
+    values = np.linspace(-1, 1, 24).reshape(2, 3, 4)
+    assert ending == "fits.fz" or assert_frames(save(tmp_path / "a.fits", values), values) == ""
 
 
 def test_a_primary_image_of_one_number_is_not_the_frames(tmp_path: Path) -> None:
@@ -92,7 +82,7 @@ def test_truncated_gzip_keeps_the_frames_before(tmp_path: Path, kept: float) -> 
     path.write_bytes(content[: int(len(content) * kept) - 4])
     with open_frames([path]) as source:
         np.testing.assert_array_equal(source.block(0, 5), frames[:5])
-        with refused("a.fits.gz: frames 5 to 19 ", "damaged or incomplete"):
+        with refused("a.fits.gz: frames 5 to 19 "):
             source.block(5, 20)
         np.testing.assert_array_equal(source.block(5, 7), frames[5:7])
 
@@ -132,7 +122,7 @@ def test_columns_of_a_table(tmp_path: Path, ending: str) -> None:
         assert stored.dtype == values.dtype
     named = "FrameCounter, Gradients, Pair, Level"
     for key in ("", ":LoopFrame", ":1", ":Text"):
-        with refused("a binary table; name a column", named):
+        with refused(named):
             read_array(f"{path}{key}")
 
 
@@ -143,27 +133,19 @@ def test_two_columns_of_one_name(tmp_path: Path) -> None:
     np.testing.assert_array_equal(read_array(f"{path}:Level"), expected)
 
 
-@pytest.mark.parametrize(
-    ("card", "value"),
-    [
-        ("TFORM4", "340000000E"),
-        ("TFORM4", "5Y"),
-        ("TFORM4", "33E"),
-        ("NAXIS1", 2**40),
-        ("NAXIS1", 7),
-        ("NAXIS2", 2**40),
-        ("TFIELDS", 3),
-        ("TFIELDS", 10**9),
+def test_damaged_fits_table_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "loop.fits"
+    table(path)
+    content = path.read_bytes()
+    size = len(fits.getheader(path, 1).tostring())
+    for card, value in (
+        *(("TFORM4", form) for form in ("340000000E", "5Y", "33E")),
+        *(("NAXIS1", 2**40), ("NAXIS1", 7), ("NAXIS2", 2**40), ("TFIELDS", 3), ("TFIELDS", 10**9)),
         ("TSCAL4", "two"),
-    ],
-)
-def test_damaged_fits_table_is_refused(tmp_path: Path, card: str, value: object) -> None:
-    table(tmp_path / "loop.fits")
-    content = (tmp_path / "loop.fits").read_bytes()
-    header = fits.Header.fromstring(content[2880 : 2880 * 3].split(b" END ")[0])
-    header[card] = value
-    text = header.tostring().encode()
-    size = len(fits.getheader(tmp_path / "loop.fits", 1).tostring())
-    (tmp_path / "loop.fits").write_bytes(content[:2880] + text + content[2880 + size :])
-    with refused("loop.fits"):
-        read_array(f"{tmp_path / 'loop.fits'}:Gradients")
+    ):
+        header = fits.Header.fromstring(content[2880 : 2880 * 3].split(b" END ")[0])
+        header[card] = value
+        path.write_bytes(content[:2880] + header.tostring().encode() + content[2880 + size :])
+        with refused("loop.fits"):
+            read_array(f"{path}:Gradients")
+            pytest.fail(f"{card} = {value} is accepted")
