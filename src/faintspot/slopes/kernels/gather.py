@@ -6,10 +6,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from faintspot.base.arrays import Array
 from faintspot.base.checks import LARGEST_FLOAT32
 from faintspot.slopes.kernels.compiling import compiled, inlined
 from faintspot.slopes.kernels.simd import (
     Lanes,
+    Vector,
     absolute,
     copy_transposed,
     get,
@@ -29,11 +31,11 @@ class Frames(NamedTuple):
     Kernels choose between the two as they run: for each type one more compilation would take seconds.
     """
 
-    counts: Any
+    counts: Array
     """uint16."""
-    values: Any
+    values: Array
     """float32."""
-    are_counts: Any
+    are_counts: bool
 
     @classmethod
     def of(cls, array: NDArray[np.generic]) -> "Frames":
@@ -51,7 +53,7 @@ class Frames(NamedTuple):
 
 
 @inlined
-def pixels_of(lanes: Lanes, frames: Frames, offset: Any) -> Any:
+def pixels_of(lanes: Lanes, frames: Frames, offset: int) -> Vector:
     """Return W consecutive pixels of frames, as numbers of the lanes' type."""
     if frames.are_counts:
         return widened(lanes, frames.counts, offset)
@@ -60,7 +62,7 @@ def pixels_of(lanes: Lanes, frames: Frames, offset: Any) -> Any:
 
 @compiled
 def gather_raw(
-    lanes: Lanes, frames: Frames, frame: Any, corners: Any, ny: int, nx: int, block: Any, image: Any
+    lanes: Lanes, frames: Frames, frame: int, corners: Array, ny: int, nx: int, block: Array, image: Array
 ) -> None:
     """Copy W sub-apertures of a frame into the lanes, as they are.
 
@@ -83,7 +85,7 @@ def gather_raw(
 
 @compiled
 def _gather(
-    lanes: Lanes, frames: Any, frame: Any, corners: Any, ny: int, nx: int, block: Any, image: Any
+    lanes: Lanes, frames: Array, frame: int, corners: Array, ny: int, nx: int, block: Array, image: Array
 ) -> None:
     """See `gather_raw`; of frames of one type."""
     width = width_of(lanes)
@@ -108,7 +110,13 @@ def _gather(
 
 @compiled
 def calibrate(
-    lanes: Lanes, image: Any, pixels: Any, calibration: Any, place: Any, saturation: Any, lane_values: Any
+    lanes: Lanes,
+    image: Array,
+    pixels: int,
+    calibration: Array,
+    place: int,
+    saturation: float,
+    lane_values: Array,
 ) -> None:
     """Turn a group's raw images into electrons, in place: (raw - dark) * scale.
 
@@ -140,7 +148,7 @@ def calibrate(
 
 
 @compiled
-def fill_bad_pixels(width: int, lane: int, ny: int, nx: int, image: Any, original: Any) -> None:
+def fill_bad_pixels(width: int, lane: int, ny: int, nx: int, image: Array, original: Array) -> None:
     """Give every NaN of a lane the mean of its good neighbours (up to 8), else of all good pixels, else 0.
 
     `original` is scratch for ny * nx numbers.
@@ -168,7 +176,7 @@ def fill_bad_pixels(width: int, lane: int, ny: int, nx: int, image: Any, origina
 
 
 @compiled
-def gather_images(width: int, images: Any, first: int, image: Any) -> None:
+def gather_images(width: int, images: Array, first: int, image: Array) -> None:
     """Copy W images of a stack (n, pixels) into the lanes; the last one fills those that are left."""
     n, pixels = images.shape
     for lane in range(width):
@@ -178,7 +186,7 @@ def gather_images(width: int, images: Any, first: int, image: Any) -> None:
 
 
 @compiled
-def scatter_images(width: int, image: Any, first: int, images: Any) -> None:
+def scatter_images(width: int, image: Array, first: int, images: Array) -> None:
     """Copy the lanes into a stack (n, pixels), as far as it has images."""
     n, pixels = images.shape
     for lane in range(min(width, n - first)):

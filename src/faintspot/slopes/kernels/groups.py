@@ -12,11 +12,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from faintspot.base.arrays import Array
 from faintspot.base.flags import SubapertureFlag
 from faintspot.slopes.kernels.compiling import compiled, compiled_with, inlined
-from faintspot.slopes.kernels.gather import calibrate, fill_bad_pixels, gather_raw, scatter_images
+from faintspot.slopes.kernels.gather import Frames, calibrate, fill_bad_pixels, gather_raw, scatter_images
 from faintspot.slopes.kernels.host import aligned_zeros, flush_subnormals, restore_control
-from faintspot.slopes.kernels.simd import Lanes, load, maximum, select, splat, store, width_of
+from faintspot.slopes.kernels.simd import Lanes, Vector, load, maximum, select, splat, store, width_of
 
 NO_FLUX = int(SubapertureFlag.NO_FLUX)
 TOO_MANY_BAD_PIXELS = int(SubapertureFlag.TOO_MANY_BAD_PIXELS)
@@ -46,69 +47,69 @@ STAGE_ROWS = 3
 class Source(NamedTuple):
     """Pixels of a block of frames, and their calibration."""
 
-    lanes: Any
+    lanes: Lanes
     """Lanes: W sub-apertures at once."""
-    frames: Any
+    frames: Frames
     """Frames."""
-    corners: Any
+    corners: Array
     """(n_subapertures, 2) int64: row and column of every window's first pixel."""
-    ny: Any
-    nx: Any
-    calibration: Any
+    ny: int
+    nx: int
+    calibration: Array
     """(n_groups, pixels, 2, W) float32: dark in ADU, and electrons per ADU (NaN in bad pixels)."""
-    saturation: Any
+    saturation: float
     """In ADU."""
 
 
 class Task(NamedTuple):
     """Processing of a block of frames: settings, prior and tables."""
 
-    settings: Any
+    settings: Array
     """(n_variants, rows, n_subapertures) float32."""
-    variants: Any
+    variants: Array
     """(n_frames,) int64: which of these tables a frame is measured with."""
-    prior: Any
+    prior: Array
     """(1 or n_frames, 2, n_subapertures) float32: predicted x and y, px from the reference position."""
     tables: Any
     """Further tables of the estimator's kernel: a NamedTuple."""
-    variances: Any
+    variances: Array | None
     """(n_groups, pixels, W) float32: variance of each dark pixel [e-^2]; None: that of the settings."""
 
 
 class Group(NamedTuple):
     """One group of one frame, for an estimator's own kernel."""
 
-    lanes: Any
-    ny: Any
-    nx: Any
-    frame: Any
+    lanes: Lanes
+    ny: int
+    nx: int
+    frame: int
     """Index of the frame in the block."""
-    first: Any
+    first: int
     """Number of the first sub-aperture; the last group of a frame repeats its last one to fill the lanes."""
-    settings: Any
+    settings: Array
     """(rows, n_subapertures)."""
-    predicted: Any
+    predicted: Array
     """(2, n_subapertures), px from the reference position."""
-    variances: Any
+    variances: Array | None
     """See `Task`; those of the group begin at element `first * pixels`."""
 
 
 class Scratch(NamedTuple):
     """Memory of one thread."""
 
-    image: Any
+    image: Array
     """((pixels + 1) * W,): calibrated images, all lanes of a pixel side by side."""
-    spare: Any
+    spare: Array
     """(pixels * W,): free for any use."""
-    results: Any
+    results: Array
     """(RESULT_ROWS * W,): written by the estimator's kernel."""
-    places: Any
+    places: Array
     """(W,) int64: free for any use."""
-    flags: Any
+    flags: Array
     """(W,) int64: bits of `SubapertureFlag`; the estimator's kernel adds its own."""
-    bad_counts: Any
+    bad_counts: Array
     """(W,) int64."""
-    iterations: Any
+    iterations: Array
     """(W,) int64: written by the estimator's kernel."""
     own: Any
     """Scratch memory of the estimator's kernel."""
@@ -117,15 +118,15 @@ class Scratch(NamedTuple):
 class SlopeArrays(NamedTuple):
     """Results, each (n_frames, n_subapertures); defined in `faintspot.Slopes`."""
 
-    x: Any
-    y: Any
-    flux: Any
-    flags: Any
-    iterations: Any
-    bad_pixels: Any
-    standard_error_x: Any
-    standard_error_y: Any
-    covariance_xy: Any
+    x: Array
+    y: Array
+    flux: Array
+    flags: Array
+    iterations: Array
+    bad_pixels: Array
+    standard_error_x: Array
+    standard_error_y: Array
+    covariance_xy: Array
 
 
 def new_scratch(lanes: Lanes, ny: int, nx: int, own: tuple[Any, ...] = ()) -> Scratch:
@@ -158,7 +159,7 @@ def gather_group(source: Source, f: int, first: int, scratch: Scratch) -> None:
 
 
 @compiled
-def prepare_group(source: Source, f: int, first: int, settings: Any, scratch: Scratch) -> None:
+def prepare_group(source: Source, f: int, first: int, settings: Array, scratch: Scratch) -> None:
     """Gather and calibrate a group, fill bad pixels and set the flags of bad and saturated pixels."""
     width, ny, nx = width_of(source.lanes), source.ny, source.nx
     gather_group(source, f, first, scratch)
@@ -173,7 +174,7 @@ def prepare_group(source: Source, f: int, first: int, settings: Any, scratch: Sc
 
 
 @inlined
-def place_of(source: Source, item: Any) -> Any:
+def place_of(source: Source, item: int) -> tuple[int, int]:
     """Return the frame of a group, and its first sub-aperture."""
     width = width_of(source.lanes)
     n_groups = (source.corners.shape[0] + width - 1) // width
@@ -181,7 +182,7 @@ def place_of(source: Source, item: Any) -> Any:
 
 
 @compiled
-def _within(slope: Any, reach: Any) -> Any:
+def _within(slope: float, reach: float) -> float:
     """Clip a slope to the allowed range."""
     return min(max(slope, -reach), reach)
 
@@ -190,15 +191,15 @@ def _within(slope: Any, reach: Any) -> Any:
 def store_slope(
     f: int,
     s: int,
-    settings: Any,
-    x: Any,
-    y: Any,
-    flux: Any,
-    error_x: Any,
-    error_y: Any,
-    bits: Any,
-    iterations: Any,
-    bad_pixels: Any,
+    settings: Array,
+    x: float,
+    y: float,
+    flux: float,
+    error_x: float,
+    error_y: float,
+    bits: int,
+    iterations: int,
+    bad_pixels: int,
     slopes: SlopeArrays,
 ) -> None:
     """Write all of one sub-aperture but the covariance; its position is the reference where it is invalid."""
@@ -222,7 +223,7 @@ def store_slope(
 
 
 @compiled
-def store_covariance(f: int, s: int, settings: Any, covariance: Any, slopes: SlopeArrays) -> None:
+def store_covariance(f: int, s: int, settings: Array, covariance: float, slopes: SlopeArrays) -> None:
     """Write the covariance of x and y, at most the product of the errors that `store_slope` wrote; or 0."""
     largest = slopes.standard_error_x[f, s] * slopes.standard_error_y[f, s]
     scale = settings[ERROR_SCALE, s]
@@ -231,7 +232,7 @@ def store_covariance(f: int, s: int, settings: Any, covariance: Any, slopes: Slo
 
 
 @compiled
-def _store_group(width: int, n: Any, group: Group, scratch: Scratch, slopes: SlopeArrays) -> None:
+def _store_group(width: int, n: int, group: Group, scratch: Scratch, slopes: SlopeArrays) -> None:
     """Write the results of a group."""
     f, found = group.frame, scratch.results
     for lane in range(min(width, n - group.first)):
@@ -255,7 +256,7 @@ def _store_group(width: int, n: Any, group: Group, scratch: Scratch, slopes: Slo
         store_covariance(f, group.first + lane, group.settings, found[COVARIANCE * width + lane], slopes)
 
 
-def locate(group: Group, tables: Any, scratch: Scratch, stages: Any) -> None:
+def locate(group: Group, tables: Any, scratch: Scratch, stages: Array) -> None:
     """Placeholder for an estimator's own kernel, which `driver_of` inserts.
 
     It reads `scratch.image` and writes `scratch.results`, `scratch.iterations` and bits of `scratch.flags`;
@@ -264,7 +265,7 @@ def locate(group: Group, tables: Any, scratch: Scratch, stages: Any) -> None:
 
 
 def measure_groups(
-    source: Source, task: Task, start: int, stop: int, scratch: Scratch, slopes: SlopeArrays, stages: Any
+    source: Source, task: Task, start: int, stop: int, scratch: Scratch, slopes: SlopeArrays, stages: Array
 ) -> None:
     """Compute the slopes of the groups [start, stop) of a block of frames.
 
@@ -316,7 +317,7 @@ def copied(template: Any, kernel: Any, **replaced: Any) -> Any:
 
 
 @compiled
-def flux_of_groups(source: Source, start: int, stop: int, scratch: Scratch, flux: Any) -> None:
+def flux_of_groups(source: Source, start: int, stop: int, scratch: Scratch, flux: Array) -> None:
     """Sum the pixels of every sub-aperture, electrons, bad ones as 0, into (n_frames, n_subapertures)."""
     for item in range(start, stop):
         f, first = place_of(source, item)
@@ -329,7 +330,7 @@ def flux_of_groups(source: Source, start: int, stop: int, scratch: Scratch, flux
 
 
 @compiled
-def flux_above_edges(source: Source, start: int, stop: int, scratch: Scratch, flux: Any) -> None:
+def flux_above_edges(source: Source, start: int, stop: int, scratch: Scratch, flux: Array) -> None:
     """Sum the pixels of each sub-aperture like `flux_of_groups`, above the mean of its outermost pixels."""
     lanes, ny, nx = source.lanes, source.ny, source.nx
     zero, one = splat(lanes, 0.0), splat(lanes, 1.0)
@@ -351,7 +352,7 @@ def flux_above_edges(source: Source, start: int, stop: int, scratch: Scratch, fl
 
 
 @inlined
-def _store_flux(lanes: Lanes, total: Any, f: int, first: int, scratch: Scratch, flux: Any) -> None:
+def _store_flux(lanes: Lanes, total: Vector, f: int, first: int, scratch: Scratch, flux: Array) -> None:
     """Write the flux of a group."""
     store(scratch.results, 0, total)
     for lane in range(min(width_of(lanes), flux.shape[1] - first)):

@@ -1,9 +1,10 @@
 """Products of a matrix with vectors and with slopes while rows arrive, and rows of telemetry."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
+from faintspot.base.arrays import Array
 from faintspot.base.flags import INVALID, UNMEASURED, SubapertureFlag
 from faintspot.slopes.kernels.compiling import compiled, inlined
 
@@ -19,17 +20,17 @@ class ProductPart(NamedTuple):
     the whole product is that sum and the product with what they differ from `taken`.
     """
 
-    columns: Any
+    columns: Array
     """(2 n, c) float32: the matrix, transposed; without rows: nothing is computed."""
-    scale: Any
+    scale: float
     """Factor on measured slopes."""
-    expected: Any
+    expected: Array
     """(2 n,) float64: subtracted from scaled slopes. Invalid sub-apertures give 0."""
-    slopes: Any
+    slopes: Array
     """(2 n,) float32: slopes of this frame so far, scaled, less `expected`."""
-    taken: Any
+    taken: Array
     """(2 n,) float32"""
-    out: Any
+    out: Array
     """(c,) float32"""
 
 
@@ -40,7 +41,7 @@ NO_PRODUCT = ProductPart(
 
 
 @compiled
-def add_products(columns: Any, vectors: Any, out: Any) -> None:
+def add_products(columns: Array, vectors: Array, out: Array) -> None:
     """Add the products of a matrix with vectors.
 
     Parameters
@@ -67,7 +68,7 @@ def add_products(columns: Any, vectors: Any, out: Any) -> None:
 
 
 @compiled
-def add_changes(columns: Any, vector: Any, taken: Any, out: Any, start: int, stop: int) -> None:
+def add_changes(columns: Array, vector: Array, taken: Array, out: Array, start: int, stop: int) -> None:
     """Add the product with what elements [start, stop) of a vector differ from those taken before.
 
     Parameters
@@ -99,13 +100,13 @@ def add_changes(columns: Any, vector: Any, taken: Any, out: Any, start: int, sto
 
 
 @inlined
-def is_measured(x: Any, y: Any, flags: Any) -> Any:
+def is_measured(x: float, y: float, flags: int) -> bool:
     """Return whether a slope counts: its sub-aperture is valid, and both numbers are finite."""
     return flags & _UNMEASURED == 0 and np.isfinite(x) and np.isfinite(y)
 
 
 @compiled
-def add_slopes(part: ProductPart, x: Any, y: Any, flags: Any, start: int, stop: int) -> None:
+def add_slopes(part: ProductPart, x: Array, y: Array, flags: Array, start: int, stop: int) -> None:
     """Add the product with the slopes of sub-apertures [start, stop), which have been measured.
 
     What is not finite, or far too large, is left for `finish_product`: the sum stays finite, also that of a
@@ -131,18 +132,18 @@ def add_slopes(part: ProductPart, x: Any, y: Any, flags: Any, start: int, stop: 
 class ProductMemory(NamedTuple):
     """Memory of a product with the slopes of a frame, of all threads."""
 
-    slopes: Any
+    slopes: Array
     """(m,) float32: see `ProductPart`."""
-    taken: Any
+    taken: Array
     """(m,) float32: see `ProductPart`."""
-    outs: Any
+    outs: Array
     """(threads, c) float32: `out` of each `ProductPart`."""
-    result: Any
+    result: Array
     """(c,) float32: the whole product."""
 
 
 @compiled
-def finish_product(columns: Any, vector: Any, memory: Any) -> None:
+def finish_product(columns: Array, vector: Array, memory: ProductMemory) -> None:
     """Write the product with a vector, of which a part may have been computed; of the next one, nothing is.
 
     Parameters
@@ -170,14 +171,14 @@ _INVALID, _NOT_CONVERGED = int(INVALID), int(SubapertureFlag.NOT_CONVERGED)
 
 @compiled
 def fill_telemetry_rows(
-    flux: Any,
-    flags: Any,
-    iterations: Any,
-    error_x: Any,
-    error_y: Any,
-    covariance_xy: Any,
-    counts: Any,
-    table: Any,
+    flux: Array,
+    flags: Array,
+    iterations: Array,
+    error_x: Array,
+    error_y: Array,
+    covariance_xy: Array,
+    counts: Array,
+    table: Array,
 ) -> None:
     """Fill a table (7, n), and count: invalid sub-apertures, those at the iteration limit, iterations.
 

@@ -14,7 +14,7 @@ import operator
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, TypeAlias
 
 from llvmlite import ir
 from numba import extending
@@ -51,28 +51,33 @@ class LanesKind(types.Type):
         super().__init__(name=f"LanesKind({dtype}, {width})")
 
 
-class Vector(types.Type):
+Vector: TypeAlias = Any
+"""W numbers in one register; their operators are defined below, where no type checker sees them."""
+Pair = tuple[Vector, Vector]
+
+
+class VectorKind(types.Type):
     """Numba's type of W numbers in one register."""
 
     def __init__(self, scalar: types.Float, width: int) -> None:
         self.scalar = scalar
         self.width = width
-        super().__init__(name=f"Vector({scalar}, {width})")
+        super().__init__(name=f"VectorKind({scalar}, {width})")
 
 
-class Mask(types.Type):
+class MaskKind(types.Type):
     """Numba's type of W truth values."""
 
     def __init__(self, width: int) -> None:
         self.width = width
-        super().__init__(name=f"Mask({width})")
+        super().__init__(name=f"MaskKind({width})")
 
 
 def _llvm_scalar(scalar: types.Float) -> ir.Type:
     return ir.FloatType() if scalar == types.float32 else ir.DoubleType()
 
 
-def _llvm_vector(vector: Vector) -> ir.VectorType:
+def _llvm_vector(vector: VectorKind) -> ir.VectorType:
     return ir.VectorType(_llvm_scalar(vector.scalar), vector.width)
 
 
@@ -84,15 +89,15 @@ def _unbox_lanes(kind: Any, value: Any, context: Any) -> NativeValue:
 register_default(LanesKind)(models.OpaqueModel)
 
 
-@register_default(Vector)
+@register_default(VectorKind)
 class _VectorModel(models.PrimitiveModel):
-    def __init__(self, manager: Any, kind: Vector) -> None:
+    def __init__(self, manager: Any, kind: VectorKind) -> None:
         super().__init__(manager, kind, _llvm_vector(kind))
 
 
-@register_default(Mask)
+@register_default(MaskKind)
 class _MaskModel(models.PrimitiveModel):
-    def __init__(self, manager: Any, kind: Mask) -> None:
+    def __init__(self, manager: Any, kind: MaskKind) -> None:
         super().__init__(manager, kind, ir.VectorType(ir.IntType(1), kind.width))
 
 
@@ -105,11 +110,11 @@ def _register_binary(operation: Any, emit: Callable[..., Any], comparison: bool)
     @infer_global(operation)
     class _Template(AbstractTemplate):
         def generic(self, args: Any, kws: Any) -> Any:
-            if len(args) == 2 and isinstance(args[0], Vector) and args[0] == args[1]:
-                return signature(Mask(args[0].width) if comparison else args[0], *args)
+            if len(args) == 2 and isinstance(args[0], VectorKind) and args[0] == args[1]:
+                return signature(MaskKind(args[0].width) if comparison else args[0], *args)
             return None
 
-    @lower_builtin(operation, Vector, Vector)
+    @lower_builtin(operation, VectorKind, VectorKind)
     def _lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         return emit(builder, *args)
 
@@ -137,7 +142,7 @@ def _data(context: Any, builder: Any, sig: Any, args: Any, array: int) -> Any:
     return context.make_array(sig.args[array])(context, builder, args[array]).data
 
 
-def _vectors(builder: Any, pointer: Any, vector: Vector) -> Any:
+def _vectors(builder: Any, pointer: Any, vector: VectorKind) -> Any:
     return builder.bitcast(pointer, _llvm_vector(vector).as_pointer())
 
 
@@ -150,7 +155,7 @@ def copy_transposed(
     Row i of the source starts at element starts[i] + shift; rows of the target follow each other from element
     `to`. The source holds unsigned integers or numbers of the lanes' own type.
     """
-    vector = Vector(lanes.scalar, lanes.width)
+    vector = VectorKind(lanes.scalar, lanes.width)
     kind = source.dtype
 
     def emit(context: Any, builder: Any, sig: Any, args: Any) -> Any:
@@ -189,7 +194,7 @@ def _transposed(builder: Any, rows: list[Any]) -> list[Any]:
 @intrinsic
 def load(typing_context: Any, lanes: Any, array: Any, offset: Any) -> Any:
     """Load W consecutive elements of a contiguous array, from element `offset`."""
-    vector = Vector(lanes.scalar, lanes.width)
+    vector = VectorKind(lanes.scalar, lanes.width)
 
     def emit(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         pointer = _vectors(builder, _element(context, builder, sig, args, 1), vector)
@@ -201,7 +206,7 @@ def load(typing_context: Any, lanes: Any, array: Any, offset: Any) -> Any:
 @intrinsic
 def widened(typing_context: Any, lanes: Any, array: Any, offset: Any) -> Any:
     """Load W consecutive unsigned integers, or numbers of the lanes' own type, as the latter."""
-    vector = Vector(lanes.scalar, lanes.width)
+    vector = VectorKind(lanes.scalar, lanes.width)
 
     def emit(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         pointer = _element(context, builder, sig, args, 1)
@@ -210,7 +215,7 @@ def widened(typing_context: Any, lanes: Any, array: Any, offset: Any) -> Any:
     return vector(lanes, array, offset), emit
 
 
-def _load_widened(context: Any, builder: Any, pointer: Any, kind: Any, vector: Vector) -> Any:
+def _load_widened(context: Any, builder: Any, pointer: Any, kind: Any, vector: VectorKind) -> Any:
     packed = ir.VectorType(context.get_data_type(kind), vector.width)
     values = builder.load(builder.bitcast(pointer, packed.as_pointer()), align=kind.bitwidth // 8)
     return values if kind == vector.scalar else builder.uitofp(values, _llvm_vector(vector))
@@ -219,7 +224,7 @@ def _load_widened(context: Any, builder: Any, pointer: Any, kind: Any, vector: V
 @intrinsic
 def gathered(typing_context: Any, lanes: Any, array: Any, places: Any, offset: Any) -> Any:
     """Load W elements of a contiguous array from the places that `places` has from element `offset`."""
-    vector = Vector(lanes.scalar, lanes.width)
+    vector = VectorKind(lanes.scalar, lanes.width)
 
     def emit(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         data, start = _data(context, builder, sig, args, 1), _element(context, builder, sig, args, 2)
@@ -287,7 +292,7 @@ def put(typing_context: Any, array: Any, offset: Any, value: Any) -> Any:
 @intrinsic
 def splat(typing_context: Any, lanes: Any, number: Any) -> Any:
     """The same number in every lane."""
-    vector = Vector(lanes.scalar, lanes.width)
+    vector = VectorKind(lanes.scalar, lanes.width)
 
     def emit(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         scalar = context.cast(builder, args[1], sig.args[1], lanes.scalar)
@@ -303,7 +308,7 @@ def splat(typing_context: Any, lanes: Any, number: Any) -> Any:
 # Functions -------------------------------------------------------------------------------------------
 
 
-def _call(builder: Any, name: str, vector: Vector, args: Any) -> Any:
+def _call(builder: Any, name: str, vector: VectorKind, args: Any) -> Any:
     llvm_vector = _llvm_vector(vector)
     suffix = f"v{vector.width}f{vector.scalar.bitwidth}"
     function_type = ir.FunctionType(llvm_vector, [llvm_vector] * len(args))
@@ -366,7 +371,7 @@ _ROOT_ESTIMATES = {
 _INVERSE_ESTIMATES = {key: name.replace("rsqrt", "rcp") for key, name in _ROOT_ESTIMATES.items()}
 
 
-def _estimate(builder: Any, vector: Vector, value: Any, names: dict[tuple[str, int], str]) -> Any:
+def _estimate(builder: Any, vector: VectorKind, value: Any, names: dict[tuple[str, int], str]) -> Any:
     """Emit the hardware's estimate, to 4e-4 or better; None where there is none."""
     features = compile_target().features
     usable = [key for key in names if key[1] == vector.width and key[0] in features]
@@ -382,7 +387,7 @@ def _estimate(builder: Any, vector: Vector, value: Any, names: dict[tuple[str, i
     return builder.call(function, arguments)
 
 
-def _constant(vector: Vector, number: float) -> Any:
+def _constant(vector: VectorKind, number: float) -> Any:
     return ir.Constant(
         _llvm_vector(vector), [ir.Constant(_llvm_scalar(vector.scalar), number)] * vector.width
     )

@@ -18,8 +18,9 @@ import llvmlite.binding as llvm
 from llvmlite import ir
 from numba.core import types
 
+from faintspot.base.arrays import Array
 from faintspot.slopes.kernels.compiling import compiled
-from faintspot.slopes.kernels.groups import SlopeArrays, Source, Task, copied
+from faintspot.slopes.kernels.groups import Scratch, SlopeArrays, Source, Task, copied
 from faintspot.slopes.kernels.ordered import look_at, now_ns, sleep_ns
 from faintspot.slopes.kernels.products import ProductPart, add_slopes
 from faintspot.slopes.kernels.simd import intrinsic, width_of
@@ -41,18 +42,18 @@ _SLOWNESS = 8  # rows that come twice as late are believed after some 6 frames
 class Arrival(NamedTuple):
     """Number of rows of a frame that have arrived, as written by another process."""
 
-    cells: Any
+    cells: Array
     """int64 array in shared memory."""
-    frame_cell: Any
+    frame_cell: int
     """Index of the cell with the number of the arriving frame."""
-    rows_cell: Any
+    rows_cell: int
     """Index of the cell with the number of rows that have arrived."""
-    control: Any
+    control: Array
     """int64 array: waiting ends when the number at `stop_cell` is not 0."""
-    stop_cell: Any
-    pace: Any
+    stop_cell: int
+    pace: Array
     """(PACE_CELLS,) int64, of one thread."""
-    due: Any
+    due: Array
     """(n_groups,) int64: learnt time from the last row of the frame before to the group's last row, ns."""
 
 
@@ -70,7 +71,7 @@ def breathe(typing_context: Any) -> Any:
 
 
 @compiled
-def rows_are_there(progress: Any, frame_cell: Any, rows_cell: Any, frame: Any, rows: Any) -> Any:
+def rows_are_there(progress: Array, frame_cell: int, rows_cell: int, frame: int, rows: int) -> bool:
     """Return whether the given number of rows of a frame, or a later frame, have arrived."""
     arriving = look_at(progress, frame_cell)
     if arriving != frame:
@@ -83,8 +84,8 @@ def rows_are_there(progress: Any, frame_cell: Any, rows_cell: Any, frame: Any, r
 
 @compiled
 def wait_for_rows(
-    progress: Any, frame_cell: Any, rows_cell: Any, frame: Any, rows: Any, control: Any, stop_cell: Any
-) -> Any:
+    progress: Array, frame_cell: int, rows_cell: int, frame: int, rows: int, control: Array, stop_cell: int
+) -> bool:
     """Wait until the rows are there, or `control[stop_cell]` is not 0; return whether they are there.
 
     After a while without rows it sleeps between looks: real-time threads that poll on all processors would
@@ -103,7 +104,7 @@ def wait_for_rows(
 
 
 @compiled
-def sleep_until_due(arrival: Arrival, frame: Any, rows: Any, item: Any) -> Any:
+def sleep_until_due(arrival: Arrival, frame: int, rows: int, item: int) -> bool:
     """Sleep until shortly before a group's rows are due; return whether to rehearse before they come.
 
     That is when the thread has slept since the last rehearsal, and there is time for one.
@@ -132,7 +133,7 @@ def sleep_until_due(arrival: Arrival, frame: Any, rows: Any, item: Any) -> Any:
 
 
 @compiled
-def wait_for_group(arrival: Arrival, frame: Any, rows: Any, item: Any) -> Any:
+def wait_for_group(arrival: Arrival, frame: int, rows: int, item: int) -> bool:
     """Wait for a group's rows, and learn when they come; return whether they are there."""
     cells = arrival.cells, arrival.frame_cell, arrival.rows_cell
     if rows_are_there(*cells, frame, rows):
@@ -147,7 +148,7 @@ def wait_for_group(arrival: Arrival, frame: Any, rows: Any, item: Any) -> Any:
 
 @compiled
 def multiply_until(
-    arrival: Arrival, frame: Any, rows: Any, item: Any, width: int, slopes: SlopeArrays, part: ProductPart
+    arrival: Arrival, frame: int, rows: int, item: int, width: int, slopes: SlopeArrays, part: ProductPart
 ) -> None:
     """Add products of groups before `item`, until the rows are there; of `width` sub-apertures each.
 
@@ -167,24 +168,24 @@ def multiply_until(
 
 
 def measure(
-    source: Source, task: Task, start: int, stop: int, scratch: Any, slopes: SlopeArrays, stages: Any
+    source: Source, task: Task, start: int, stop: int, scratch: Scratch, slopes: SlopeArrays, stages: Array
 ) -> None:
     """Stand for the compiled function that measures groups, which `streamed` puts in its place."""
 
 
 def stream_groups(
     arrival: Arrival,
-    frame: Any,
-    last_rows: Any,
+    frame: int,
+    last_rows: Array,
     source: Source,
     task: Task,
     start: int,
     stop: int,
-    scratch: Any,
+    scratch: Scratch,
     slopes: SlopeArrays,
-    stages: Any,
+    stages: Array,
     part: ProductPart,
-) -> Any:
+) -> int:
     """Measure the groups [start, stop) of a frame while it arrives, and begin the product with their slopes.
 
     Parameters

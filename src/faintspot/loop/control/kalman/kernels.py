@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from faintspot.base.arrays import Array
 from faintspot.loop.control import integrator
 from faintspot.loop.control.base import LEAST_SHARE, LEAST_VARIANCE_PX2
 from faintspot.loop.control.integrator import integrate_wavefront
@@ -35,61 +36,65 @@ MADE, LEFT, OFFSET = 4, 5, 7
 COMMAND_ROWS = 8
 
 
+Rows = tuple[int, int, int]
+Numbers = tuple[float, float, Array, int]
+
+
 class Matrices(NamedTuple):
     """Constant matrices, transposed so that the terms of a sum are adjacent in memory."""
 
-    interaction: Any
+    interaction: Array
     """(commands, m)"""
-    reconstruct: object
+    reconstruct: Array
     """(m, commands)"""
-    phase: Any
+    phase: Array
     """(m, commands)"""
-    covariance: Any
+    covariance: Array
     """(m, states): covariance of the errors of slopes and state before a measurement."""
-    uncertainty: object
+    uncertainty: Array
     """(m, m): covariance of the slopes' error."""
-    usual_inverse: object
+    usual_inverse: Array
     """(m, m): inverse of the slopes' covariance with their usual noise."""
-    usual_variance: Any
+    usual_variance: Array
     """(m,): diagonal of that covariance."""
-    onward: Any
+    onward: Array
     """(layers, 2 m, m)"""
-    command: Any
+    command: Array
     """(states, commands): matrix from the state to commands."""
 
 
 class Lines(NamedTuple):
     """Delayed commands: of the mirror, and of both controllers."""
 
-    true: Any
+    true: Array
     """(delay + 1, commands)"""
-    learnt: Any
-    plain: Any
+    learnt: Array
+    plain: Array
 
 
 class Memory(NamedTuple):
     """State that persists between frames, and work arrays."""
 
-    state: Any
+    state: Array
     """(layers, 2, m): predicted state of the next frame."""
     guard: Any
     """() array of `GUARD`."""
-    slopes: Any
+    slopes: Array
     """(SLOPE_ROWS, m)"""
-    commands: Any
+    commands: Array
     """(COMMAND_ROWS, commands)"""
 
 
 class Frame(NamedTuple):
     """Slopes of a frame, which are finite, and their noise."""
 
-    slopes: Any
+    slopes: Array
     """(m,) float64"""
-    errors: Any
+    errors: Array
     """(m,) float64; infinite: not measured."""
-    covariance: Any
+    covariance: Array
     """(m / 2,) float64: covariances of the noise of x and y."""
-    prior_std: Any
+    prior_std: Array
     """(m,) or (0,) float64: prior of the estimator; none."""
     noise_factor: float
     """Factor on the errors' variances."""
@@ -101,7 +106,7 @@ _compiled = partial(_kernel, sources=tuple(map(Path, _SOURCES)))
 
 
 @_compiled
-def _take(frame: Any, rows: Any, chosen: Any) -> None:
+def _take(frame: Frame, rows: Array, chosen: bool) -> None:
     """Write the inputs of both controllers; see `telemetry.without_prior`."""
     slopes, errors, covariance, prior_std, noise_factor = frame
     for s in range(slopes.shape[0]):
@@ -131,7 +136,7 @@ def _take(frame: Any, rows: Any, chosen: Any) -> None:
 
 
 @_compiled
-def _correlate(covariance: Any, factor: Any, rows: Any) -> None:
+def _correlate(covariance: Array, factor: float, rows: Array) -> None:
     """Write the covariances of x and y, 0 where one was not measured."""
     n = covariance.shape[0]
     for s in range(n):
@@ -140,7 +145,7 @@ def _correlate(covariance: Any, factor: Any, rows: Any) -> None:
 
 
 @_compiled
-def _failure(matrices: Any, rows: Any) -> float:
+def _failure(matrices: Matrices, rows: Array) -> float:
     """Return the mean square of the surprises in their expected deviations."""
     total, count = 0.0, 0.0
     for s in range(rows.shape[1]):
@@ -151,7 +156,7 @@ def _failure(matrices: Any, rows: Any) -> float:
 
 
 @_compiled
-def _solve(matrices: Any, rows: Any, steps: Any) -> None:
+def _solve(matrices: Matrices, rows: Array, steps: int) -> None:
     """Write x with (S + V) x = surprise: S of the predicted slopes' error, V of this frame's noise.
 
     Conjugate gradients among the slopes that were measured. What they are preconditioned by is the inverse
@@ -198,7 +203,7 @@ def _solve(matrices: Any, rows: Any, steps: Any) -> None:
 
 
 @_compiled
-def _filter(matrices: Any, memory: Any, steps: Any, largest: Any, command: Any) -> float:
+def _filter(matrices: Matrices, memory: Memory, steps: int, largest: Array, command: Array) -> float:
     """Correct the state and write the filter's command; return its sum before clipping."""
     rows = memory.slopes
     state = memory.state.reshape(1, memory.state.size)
@@ -214,7 +219,9 @@ def _filter(matrices: Any, memory: Any, steps: Any, largest: Any, command: Any) 
 
 
 @_compiled
-def _integrate(matrices: Any, memory: Any, gain: Any, keep: Any, largest: Any, command: Any) -> float:
+def _integrate(
+    matrices: Matrices, memory: Memory, gain: float, keep: float, largest: Array, command: Array
+) -> float:
     """Write the integrator's command; return its sum before clipping."""
     product = memory.commands[MADE : MADE + 1]
     product[:] = 0.0
@@ -225,7 +232,7 @@ def _integrate(matrices: Any, memory: Any, gain: Any, keep: Any, largest: Any, c
 
 
 @_compiled
-def _send(command: Any, true: Any, row: Any, memory: Any, largest: Any) -> None:
+def _send(command: Array, true: Array, row: int, memory: Memory, largest: Array) -> None:
     """Write the mirror's command; see `GuardedController`."""
     guard, offset = memory.guard[()], memory.commands[OFFSET]
     if guard.sent != guard.chosen:
@@ -242,7 +249,7 @@ def _send(command: Any, true: Any, row: Any, memory: Any, largest: Any) -> None:
 
 
 @_compiled
-def _advance(matrices: Any, memory: Any) -> None:
+def _advance(matrices: Matrices, memory: Memory) -> None:
     """Predict the filter's state of the next frame."""
     state, rows = memory.state, memory.slopes
     now, m = rows[SPARE : SPARE + 1], rows.shape[1]
@@ -257,7 +264,7 @@ def _advance(matrices: Any, memory: Any) -> None:
 
 
 @_compiled
-def hold(matrices: Any, lines: Any, next_rows: Any, memory: Any) -> None:
+def hold(matrices: Matrices, lines: Lines, next_rows: Rows, memory: Memory) -> None:
     """Write the slopes caused by the commands that act in the next frame.
 
     Parameters
@@ -280,7 +287,9 @@ def hold(matrices: Any, lines: Any, next_rows: Any, memory: Any) -> None:
 
 
 @_compiled
-def follow(frame: Any, numbers: Any, matrices: Any, lines: Any, next_rows: Any, memory: Any) -> float:
+def follow(
+    frame: Frame, numbers: Numbers, matrices: Matrices, lines: Lines, next_rows: Rows, memory: Memory
+) -> float:
     """Write the selected controller's command for the mirror; return its sum before clipping.
 
     Parameters
@@ -306,7 +315,7 @@ def follow(frame: Any, numbers: Any, matrices: Any, lines: Any, next_rows: Any, 
 
 
 @_compiled
-def go_on(numbers: Any, matrices: Any, lines: Any, next_rows: Any, memory: Any) -> float:
+def go_on(numbers: Numbers, matrices: Matrices, lines: Lines, next_rows: Rows, memory: Memory) -> float:
     """Complete a frame after its command was sent: the other controller, the guard, the state.
 
     Return the sum of the other controller's command before it is cut.
@@ -335,7 +344,7 @@ def go_on(numbers: Any, matrices: Any, lines: Any, next_rows: Any, memory: Any) 
 
 
 @_compiled
-def _adopt(lines: Any, next_rows: Any) -> None:
+def _adopt(lines: Lines, next_rows: Rows) -> None:
     """Let the integrator continue from the mirror's commands; the row of its own is not yet sent."""
     row, _, of_plain = next_rows
     length = lines.true.shape[0]
@@ -346,7 +355,14 @@ def _adopt(lines: Any, next_rows: Any) -> None:
 
 
 @_compiled
-def replay(recorded: Any, numbers: Any, matrices: Any, line: Any, memory: Any, squares: Any) -> None:
+def replay(
+    recorded: tuple[Array, Array, Array, Array],
+    numbers: Numbers,
+    matrices: Matrices,
+    line: Array,
+    memory: Memory,
+    squares: Array,
+) -> None:
     """Write the squared residual that the filter alone would have left in each recorded frame.
 
     Parameters

@@ -25,6 +25,7 @@ from faintspot.slopes.estimators.sensor import Scene, Sensor
 from faintspot.slopes.estimators.spot_tables import SpotModel, model_of_psf
 from faintspot.slopes.kernels.groups import RANGE, flux_above_edges
 from faintspot.slopes.kernels.positions import fits as spot_fits
+from faintspot.slopes.kernels.positions import spot_rows
 from faintspot.slopes.spots.psf import PSF
 
 _BLURS = (0.4, 0.0, 0.8, 1.2)  # of the PSF of a speckled spot, in units of lambda / d
@@ -177,14 +178,14 @@ class _MaximumAPosterioriPlan(LikelihoodPlan):
         """Shape of the table of each kind of sub-aperture: positions, rows, columns."""
 
     @property
-    def tables(self) -> spot_fits.PosteriorTables:
+    def tables(self) -> spot_rows.PosteriorTables:
         """See `EstimatorPlan`."""
         logarithms, constants = (np.concatenate(parts) for parts in zip(*self._parts, strict=True))
         self._parts = [(logarithms, constants)]
-        return spot_fits.PosteriorTables(self.model_tables, logarithms, constants, self._grid, self._spacing)
+        return spot_rows.PosteriorTables(self.model_tables, logarithms, constants, self._grid, self._spacing)
 
     @cached_property
-    def own_scratch(self) -> partial[spot_fits.SpotScratch]:
+    def own_scratch(self) -> partial[spot_rows.SpotScratch]:
         """See `EstimatorPlan`."""
         return partial(super().own_scratch, positions=len(self._grid))
 

@@ -20,6 +20,7 @@ from faintspot.slopes.estimators.sensor import Scene
 from faintspot.slopes.estimators.spot_tables import SpotModel
 from faintspot.slopes.kernels.groups import RANGE
 from faintspot.slopes.kernels.positions import fits as spot_fits
+from faintspot.slopes.kernels.positions import spot_rows
 from faintspot.slopes.kernels.positions.brightest import SMALLEST_VARIANCE
 
 _STEPS_IN_BRIGHT_FLUX = 12
@@ -76,22 +77,22 @@ class SpotPlan(EstimatorPlan):
         return np.ascontiguousarray(self.model.taps[self.model.index])
 
     @property
-    def model_tables(self) -> spot_fits.ModelTables:
+    def model_tables(self) -> spot_rows.ModelTables:
         """Tables of the kernels that use a profile."""
         steps = self.estimator.step_count
-        return spot_fits.ModelTables(
+        return spot_rows.ModelTables(
             steps, self.rounds_electrons, self.fits_background, self.taps, self.model.tables
         )
 
     @property
-    def tables(self) -> spot_fits.ModelTables | spot_fits.PosteriorTables:
+    def tables(self) -> spot_rows.ModelTables | spot_rows.PosteriorTables:
         """See `EstimatorPlan`."""
         return self.model_tables
 
     @cached_property
-    def own_scratch(self) -> partial[spot_fits.SpotScratch]:
+    def own_scratch(self) -> partial[spot_rows.SpotScratch]:
         """See `EstimatorPlan`."""
-        return partial(spot_fits.spot_scratch, rank=self.model.rank, taps=self.taps.shape[2])
+        return partial(spot_rows.spot_scratch, rank=self.model.rank, taps=self.taps.shape[2])
 
     def fill(self, table: NDArray[np.float32]) -> None:
         """See `EstimatorPlan`."""

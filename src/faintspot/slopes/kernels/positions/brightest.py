@@ -3,9 +3,12 @@
 import math
 from typing import Any
 
+from faintspot.base.arrays import Array
 from faintspot.slopes.kernels.compiling import compiled, inlined
 from faintspot.slopes.kernels.simd import (
     Lanes,
+    Pair,
+    Vector,
     absolute,
     any_lane,
     load,
@@ -41,7 +44,7 @@ _COUNTING_PASSES = 24  # usually 5 to 8 are enough; outliers go on to the exact 
 
 
 @compiled
-def gather_taps(width: int, first: Any, taps: Any, lane_taps: Any) -> None:
+def gather_taps(width: int, first: int, taps: Array, lane_taps: Array) -> None:
     """Put the taps (n_subapertures, 2, 1 + reach) of a group side by side: (2, 1 + reach, W)."""
     n, _, count = taps.shape
     for lane in range(width):
@@ -53,8 +56,8 @@ def gather_taps(width: int, first: Any, taps: Any, lane_taps: Any) -> None:
 
 @compiled
 def smooth_pixel(
-    lanes: Lanes, image: Any, at: Any, step: Any, place: Any, n: Any, taps: Any, axis: Any, reach: Any
-) -> Any:
+    lanes: Lanes, image: Array, at: int, step: int, place: int, n: int, taps: Array, axis: int, reach: int
+) -> Vector:
     """One pixel smoothed along one axis; `place` of n counts along it, `step` elements lie between two.
 
     `taps` is (2, 1 + reach, W), flat: along x and y, the central one first.
@@ -73,7 +76,7 @@ def smooth_pixel(
 
 @compiled
 def smooth_group(
-    lanes: Lanes, image: Any, ny: int, nx: int, reach: Any, taps: Any, half_done: Any, output: Any
+    lanes: Lanes, image: Array, ny: int, nx: int, reach: int, taps: Array, half_done: Array, output: Array
 ) -> None:
     """Smooth whole images along x, into `half_done`, then along y."""
     width = width_of(lanes)
@@ -88,7 +91,7 @@ def smooth_group(
 
 
 @compiled
-def variance_of(lanes: Lanes, variances: Any, at: Any, mean: Any) -> Any:
+def variance_of(lanes: Lanes, variances: Array | None, at: int, mean: Vector) -> Vector:
     """Return the variance of the pixel at element `at`; `mean` where it is the same in all."""
     if variances is None:
         return mean
@@ -96,7 +99,9 @@ def variance_of(lanes: Lanes, variances: Any, at: Any, mean: Any) -> Any:
 
 
 @compiled
-def weight_variance_of(lanes: Lanes, variances: Any, at: Any, mean: Any, weight: Any) -> Any:
+def weight_variance_of(
+    lanes: Lanes, variances: Array | None, at: int, mean: Vector, weight: Vector
+) -> Vector:
     """Return the variance that weighs the pixel at `at`; `weight` weighs a pixel of variance `mean`."""
     if variances is None:
         return weight
@@ -105,7 +110,7 @@ def weight_variance_of(lanes: Lanes, variances: Any, at: Any, mean: Any, weight:
 
 
 @compiled
-def relative_variance(lanes: Lanes, variances: Any, at: Any, mean: Any) -> Any:
+def relative_variance(lanes: Lanes, variances: Array | None, at: int, mean: Vector) -> Vector:
     """Return the variance of the pixel at `at` in units of `mean`, neither below the smallest."""
     if variances is None:
         return splat(lanes, 1.0)
@@ -115,8 +120,8 @@ def relative_variance(lanes: Lanes, variances: Any, at: Any, mean: Any) -> Any:
 
 @compiled
 def without_noisy_pixels(
-    lanes: Lanes, variances: Any, place: Any, pixels: Any, mean: Any, image: Any, damped: Any
-) -> Any:
+    lanes: Lanes, variances: Array | None, place: int, pixels: int, mean: Vector, image: Array, damped: Array
+) -> Array:
     """Return an image in which pixels noisier than the mean variance count less, by the ratio of variances.
 
     It is written to `damped`; without variances the image itself is returned.
@@ -131,7 +136,7 @@ def without_noisy_pixels(
 
 
 @inlined
-def _tally(lanes: Lanes, image: Any, at: Any, pivot: Any, count: Any, total: Any) -> Any:
+def _tally(lanes: Lanes, image: Array, at: int, pivot: Vector, count: Vector, total: Vector) -> Pair:
     """Add one pixel to number and sum of those above the pivot."""
     g = load(lanes, image, at)
     above = g > pivot
@@ -139,7 +144,7 @@ def _tally(lanes: Lanes, image: Any, at: Any, pivot: Any, count: Any, total: Any
 
 
 @compiled
-def _sum_above(lanes: Lanes, image: Any, pixels: Any, pivot: Any) -> Any:
+def _sum_above(lanes: Lanes, image: Array, pixels: int, pivot: Vector) -> Pair:
     """Return number and sum of the pixels above the pivot, in four independent sums."""
     width = width_of(lanes)
     zero = splat(lanes, 0.0)
@@ -156,7 +161,7 @@ def _sum_above(lanes: Lanes, image: Any, pixels: Any, pivot: Any) -> Any:
 
 
 @compiled
-def _range_and_sum(lanes: Lanes, image: Any, pixels: Any) -> Any:
+def _range_and_sum(lanes: Lanes, image: Array, pixels: int) -> tuple[Vector, Vector, Vector]:
     """Return the smallest and the largest pixel, and the sum of all."""
     width = width_of(lanes)
     low = high = other_low = other_high = load(lanes, image, 0)
@@ -173,7 +178,7 @@ def _range_and_sum(lanes: Lanes, image: Any, pixels: Any) -> Any:
 
 
 @compiled
-def _middle(lanes: Lanes, low: Any, high: Any) -> Any:
+def _middle(lanes: Lanes, low: Vector, high: Vector) -> Vector:
     """Return a number in [low, high), for low < high, near the middle."""
     half = splat(lanes, 0.5)
     middle = maximum(half * low + half * high, low)
@@ -181,7 +186,7 @@ def _middle(lanes: Lanes, low: Any, high: Any) -> Any:
 
 
 @inlined
-def _pivot(lanes: Lanes, mean: Any, low: Any, high: Any, wanted: Any) -> Any:
+def _pivot(lanes: Lanes, mean: Vector, low: Vector, high: Vector, wanted: Vector) -> Vector:
     """Return a pivot in a bracket, with about the wanted fraction of the bracket's pixels above it.
 
     The mean parts them in halves. How far to go from it follows from the most variance that a distribution of
@@ -192,7 +197,9 @@ def _pivot(lanes: Lanes, mean: Any, low: Any, high: Any, wanted: Any) -> Any:
 
 
 @compiled
-def _bracket(lanes: Lanes, image: Any, pixels: Any, rank: Any, low: Any, high: Any, total: Any) -> Any:
+def _bracket(
+    lanes: Lanes, image: Array, pixels: int, rank: Vector, low: Vector, high: Vector, total: Vector
+) -> tuple[Vector, Vector, Vector, Vector]:
     """Part the RANK-th largest pixel from its neighbours in rank, or from all that differ from it.
 
     As quickselect does, but without moving pixels: count those above a pivot. Returns low and high, and how
@@ -224,7 +231,7 @@ def _bracket(lanes: Lanes, image: Any, pixels: Any, rank: Any, low: Any, high: A
 
 
 @compiled
-def _ends(lanes: Lanes, image: Any, pixels: Any, low: Any, high: Any) -> Any:
+def _ends(lanes: Lanes, image: Array, pixels: int, low: Vector, high: Vector) -> Pair:
     """Return the smallest pixel above low, and the largest one not above high."""
     width = width_of(lanes)
     most, least = splat(lanes, math.inf), splat(lanes, -math.inf)
@@ -237,7 +244,7 @@ def _ends(lanes: Lanes, image: Any, pixels: Any, low: Any, high: Any) -> Any:
 
 
 @compiled
-def _step_exactly(lanes: Lanes, image: Any, pixels: Any, rank: Any, low: Any, high: Any) -> Any:
+def _step_exactly(lanes: Lanes, image: Array, pixels: int, rank: Vector, low: Vector, high: Vector) -> Pair:
     """Halve the bracket [low, high] of the RANK-th largest pixel; its new ends are pixel values."""
     width = width_of(lanes)
     zero, one = splat(lanes, 0.0), splat(lanes, 1.0)
@@ -258,7 +265,7 @@ def _step_exactly(lanes: Lanes, image: Any, pixels: Any, rank: Any, low: Any, hi
 
 
 @compiled
-def find_threshold(lanes: Lanes, image: Any, pixels: Any, lane_values: Any) -> None:
+def find_threshold(lanes: Lanes, image: Array, pixels: int, lane_values: Array) -> None:
     """Find the RANK-th largest pixel of every lane, exactly, and the largest magnitude."""
     width = width_of(lanes)
     one = splat(lanes, 1.0)
@@ -275,7 +282,7 @@ def find_threshold(lanes: Lanes, image: Any, pixels: Any, lane_values: Any) -> N
 
 
 @compiled
-def find_largest(lanes: Lanes, image: Any, pixels: Any, lane_values: Any) -> None:
+def find_largest(lanes: Lanes, image: Array, pixels: int, lane_values: Array) -> None:
     """Find the largest magnitude of every lane."""
     width = width_of(lanes)
     largest = splat(lanes, 0.0)
@@ -285,7 +292,7 @@ def find_largest(lanes: Lanes, image: Any, pixels: Any, lane_values: Any) -> Non
 
 
 @compiled
-def subtract_background(lanes: Lanes, image: Any, pixels: Any, lane_values: Any, left: Any) -> None:
+def subtract_background(lanes: Lanes, image: Array, pixels: int, lane_values: Array, left: Array) -> None:
     """Zero the pixels below THRESHOLD, and take it off the others where SUBTRACT is 1; `left` is written."""
     width = width_of(lanes)
     zero = splat(lanes, 0.0)
@@ -297,13 +304,15 @@ def subtract_background(lanes: Lanes, image: Any, pixels: Any, lane_values: Any,
 
 
 @inlined
-def _from_middle(lanes: Lanes, i: Any, n: Any) -> Any:
+def _from_middle(lanes: Lanes, i: int, n: int) -> Vector:
     """Return the position of pixel i of n [px]."""
     return splat(lanes, i - 0.5 * (n - 1))
 
 
 @compiled
-def _store_centre(lanes: Lanes, total: Any, moment_x: Any, moment_y: Any, lane_values: Any) -> Any:
+def _store_centre(
+    lanes: Lanes, total: Vector, moment_x: Vector, moment_y: Vector, lane_values: Array
+) -> Vector:
     """Write SUM, X and Y, (0, 0) where the sum is not positive; return 1 / SUM, or 1."""
     width = width_of(lanes)
     zero, one = splat(lanes, 0.0), splat(lanes, 1.0)
@@ -316,7 +325,7 @@ def _store_centre(lanes: Lanes, total: Any, moment_x: Any, moment_y: Any, lane_v
 
 
 @compiled
-def centre_of_gravity(lanes: Lanes, image: Any, ny: int, nx: int, lane_values: Any) -> None:
+def centre_of_gravity(lanes: Lanes, image: Array, ny: int, nx: int, lane_values: Array) -> None:
     """Write the flux after THRESHOLD and SUBTRACT in each lane, and its centre of gravity.
 
     (0, 0) where the sum is not positive.
@@ -339,7 +348,14 @@ def centre_of_gravity(lanes: Lanes, image: Any, ny: int, nx: int, lane_values: A
 
 @compiled
 def centre_and_error(
-    lanes: Lanes, measured: Any, variances: Any, place: Any, image: Any, ny: int, nx: int, lane_values: Any
+    lanes: Lanes,
+    measured: Array,
+    variances: Array | None,
+    place: int,
+    image: Array,
+    ny: int,
+    nx: int,
+    lane_values: Array,
 ) -> None:
     """Write the centre of gravity and its errors: the propagated noise of the remaining pixels.
 
@@ -393,10 +409,10 @@ def _store_error(
     noise: Any,
     first: Any,
     second: Any,
-    inverse: Any,
+    inverse: Vector,
     position: Any,
     error: Any,
-    lane_values: Any,
+    lane_values: Array,
 ) -> None:
     """Write a standard error, from the noise's moments about the window's middle."""
     width = width_of(lanes)
@@ -411,14 +427,14 @@ def _store_error(
 @compiled
 def errors_of_smoothed(
     lanes: Lanes,
-    measured: Any,
-    variances: Any,
-    place: Any,
-    image: Any,
+    measured: Array,
+    variances: Array | None,
+    place: int,
+    image: Array,
     ny: int,
     nx: int,
     smoothing: Any,
-    lane_values: Any,
+    lane_values: Array,
 ) -> None:
     """Replace finite errors of `centre_and_error` by those of a smoothed image.
 

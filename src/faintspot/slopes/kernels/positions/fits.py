@@ -1,10 +1,10 @@
 """Estimators that know the spot: the own kernels of weighted, fitted and posterior estimators."""
 
 import math
-from typing import Any, NamedTuple
 
 import numpy as np
 
+from faintspot.base.arrays import Array
 from faintspot.base.flags import SubapertureFlag
 from faintspot.slopes.kernels import groups
 from faintspot.slopes.kernels.compiling import compiled
@@ -21,7 +21,6 @@ from faintspot.slopes.kernels.groups import (
     Scratch,
     driver_of,
 )
-from faintspot.slopes.kernels.host import aligned_zeros
 from faintspot.slopes.kernels.positions import spot_rows
 from faintspot.slopes.kernels.positions.brightest import (
     SMALLEST_VARIANCE,
@@ -31,8 +30,14 @@ from faintspot.slopes.kernels.positions.brightest import (
 )
 from faintspot.slopes.kernels.positions.likelihood import fit_group
 from faintspot.slopes.kernels.positions.means import posterior_of_group, weigh_group
-from faintspot.slopes.kernels.positions.spot_rows import LEAST_FLUX_E, find_start, subtract_background
-from faintspot.slopes.kernels.simd import Lanes, load, rounded, select, splat, store, width_of
+from faintspot.slopes.kernels.positions.spot_rows import (
+    LEAST_FLUX_E,
+    ModelTables,
+    PosteriorTables,
+    find_start,
+    subtract_background,
+)
+from faintspot.slopes.kernels.simd import load, rounded, select, splat, store, width_of
 
 # Rows of the settings' table that follow the common ones: flux that is expected; weights of a fit; prior.
 FLUX, WEIGHT_FLOOR, WEIGHT_EXCESS, MODEL_ERROR, PRIOR_WEIGHT = range(COMMON_ROWS, COMMON_ROWS + 5)
@@ -56,74 +61,8 @@ _MOVING = 2.0  # standard errors that the next steps would add
 _BROAD = 0.5  # standard deviation, in units of the grid's spacing, above which sums over the grid are good
 
 
-class ModelTables(NamedTuple):
-    """Tables of the kernels that use a profile: weighted and fitted estimators."""
-
-    steps: Any
-    round_electrons: Any
-    """Whether images are rounded to whole electrons."""
-    background: Any
-    """Whether a constant is fitted along with the spot."""
-    taps: Any
-    """(n_subapertures, 2, 1 + reach) float32: of the smoothing that finds the start."""
-    model: Any
-    """(n_models, 2, rank, 2, PHASES, length) float32: see `spot_rows.look_up`."""
-
-
-class PosteriorTables(NamedTuple):
-    """Tables of the kernel that starts from the mean of the posterior."""
-
-    fit: Any
-    """ModelTables."""
-    logarithms: Any
-    """(n_tables, n_positions, ny, n_vectors * W) float32: k_p of each table and position, 0 beyond nx."""
-    constants: Any
-    """(n_tables, n_positions) float32: c_p."""
-    grid: Any
-    """(n_positions, 2) float32: x and y, px."""
-    spacing: Any
-    """Spacing of the grid, px."""
-
-
-class SpotScratch(NamedTuple):
-    """Memory of one thread."""
-
-    taps: Any
-    lane_values: Any
-    """(LANE_ROWS * W,)."""
-    profiles: Any
-    """(2, rank, 2, padded, W): of the first nx or ny of `padded` pixels."""
-    rows: Any
-    """(ny, n_vectors, W, W)."""
-    logarithms: Any
-    """(n_positions,) float64."""
-    starts: Any
-    """(W,) int64: free for any use."""
-    models: Any
-    """(W,) int64: model of each lane in `ModelTables.model`."""
-    kinds: Any
-    """(W,) int64: table of each lane in `PosteriorTables.logarithms`."""
-
-
-def spot_scratch(
-    lanes: Lanes, ny: int, nx: int, rank: int = 1, taps: int = 1, positions: int = 0
-) -> SpotScratch:
-    """Return the kernels' own memory, for models of a rank, a number of taps and of a grid's positions."""
-    width = lanes.width
-    vectors = -(-nx // width)
-    padded = -(-max(ny, nx) // width) * width
-    return SpotScratch(
-        aligned_zeros(2 * taps * width, lanes.dtype),
-        aligned_zeros(spot_rows.LANE_ROWS * width, lanes.dtype),
-        aligned_zeros(4 * rank * padded * width, lanes.dtype).reshape(2, rank, 2, padded, width),
-        aligned_zeros(ny * vectors * width * width, lanes.dtype).reshape(ny, vectors, width, width),
-        np.zeros(positions),
-        *(np.zeros(width, np.int64) for _ in range(3)),
-    )
-
-
 @compiled
-def locate_weighted(group: Group, tables: Any, scratch: Scratch, stages: Any) -> None:
+def locate_weighted(group: Group, tables: ModelTables, scratch: Scratch, stages: Array) -> None:
     """Follow the spots of a group with a weight."""
     own = scratch.own
     _begin(group, scratch)
@@ -133,7 +72,7 @@ def locate_weighted(group: Group, tables: Any, scratch: Scratch, stages: Any) ->
 
 
 @compiled
-def locate_fitted(group: Group, tables: Any, scratch: Scratch, stages: Any) -> None:
+def locate_fitted(group: Group, tables: ModelTables, scratch: Scratch, stages: Array) -> None:
     """Fit position and flux of the spots of a group."""
     _round(group, tables.round_electrons, scratch.image)
     _begin(group, scratch)
@@ -146,7 +85,7 @@ def locate_fitted(group: Group, tables: Any, scratch: Scratch, stages: Any) -> N
 
 
 @compiled
-def locate_posterior(group: Group, tables: Any, scratch: Scratch, stages: Any) -> None:
+def locate_posterior(group: Group, tables: PosteriorTables, scratch: Scratch, stages: Array) -> None:
     """Fit the spots of a group from the posterior's mean, which stays where the posterior is broad."""
     own = scratch.own
     lanes, pixels = group.lanes, group.ny * group.nx
@@ -174,7 +113,7 @@ def locate_posterior(group: Group, tables: Any, scratch: Scratch, stages: Any) -
 
 
 @compiled
-def _round(group: Group, round_electrons: Any, image: Any) -> None:
+def _round(group: Group, round_electrons: bool, image: Array) -> None:
     """Round pixels of low noise to whole electrons, where that is asked for."""
     lanes, pixels = group.lanes, group.ny * group.nx
     width, place = width_of(lanes), group.first * pixels
@@ -220,7 +159,7 @@ def _begin(group: Group, scratch: Scratch) -> None:
 
 
 @compiled
-def _begin_at_peak(group: Group, taps: Any, scratch: Scratch) -> None:
+def _begin_at_peak(group: Group, taps: Array, scratch: Scratch) -> None:
     """Start from the peak of the smoothed image."""
     lanes, own = group.lanes, scratch.own
     gather_taps(width_of(lanes), group.first, taps, own.taps)
@@ -233,7 +172,7 @@ def _begin_at_peak(group: Group, taps: Any, scratch: Scratch) -> None:
 
 
 @compiled
-def _fit(group: Group, tables: Any, scratch: Scratch) -> None:
+def _fit(group: Group, tables: ModelTables, scratch: Scratch) -> None:
     """Fit from the current positions; the floor of the weights is a fraction of the flux found so far."""
     width, first, settings, own = width_of(group.lanes), group.first, group.settings, scratch.own
     lane_values = own.lane_values
@@ -249,7 +188,7 @@ def _fit(group: Group, tables: Any, scratch: Scratch) -> None:
 
 
 @compiled
-def _expect_flux(group: Group, lane_values: Any) -> None:
+def _expect_flux(group: Group, lane_values: Array) -> None:
     """Use the expected flux as the flux."""
     width, first, settings = width_of(group.lanes), group.first, group.settings
     for lane in range(width):
@@ -258,7 +197,7 @@ def _expect_flux(group: Group, lane_values: Any) -> None:
 
 
 @compiled
-def _begin_at_mean_or_peak(width: int, lane_values: Any) -> None:
+def _begin_at_mean_or_peak(width: int, lane_values: Array) -> None:
     """Begin at the posterior's mean, or at the peak where the grid is too coarse for a narrow posterior.
 
     The likelihood of a PSF that is slightly wrong has several maxima in high flux. The peak beside the
@@ -281,7 +220,7 @@ def _begin_at_mean_or_peak(width: int, lane_values: Any) -> None:
 
 
 @compiled
-def _keep_broad_posteriors(width: int, lane_values: Any) -> None:
+def _keep_broad_posteriors(width: int, lane_values: Array) -> None:
     """Along an axis on which the posterior is broader than its grid, its mean and spread are the result.
 
     If it is the only one, x and y stay as correlated as in the fit.
@@ -305,7 +244,7 @@ def _keep_broad_posteriors(width: int, lane_values: Any) -> None:
 
 
 @compiled
-def _is_illuminated(width: int, lane: int, expected: Any, lane_values: Any) -> Any:
+def _is_illuminated(width: int, lane: int, expected: float, lane_values: Array) -> bool:
     """Return whether there is a spot: its expected flux is not clearly missing, or it is significant."""
     seen = lane_values[spot_rows.SEEN * width + lane]
     error = lane_values[spot_rows.SEEN_ERROR * width + lane]
@@ -315,7 +254,7 @@ def _is_illuminated(width: int, lane: int, expected: Any, lane_values: Any) -> A
 
 
 @compiled
-def _is_moving(width: int, lane: int, error: Any, lane_values: Any) -> Any:
+def _is_moving(width: int, lane: int, error: float, lane_values: Array) -> bool:
     """Return whether further steps, as a geometric series, would move a lane by several standard errors."""
     move = lane_values[spot_rows.MOVE * width + lane]
     before = lane_values[spot_rows.MOVE_BEFORE * width + lane]
@@ -323,7 +262,7 @@ def _is_moving(width: int, lane: int, error: Any, lane_values: Any) -> Any:
 
 
 @compiled
-def _finish(group: Group, steps: Any, expects_flux: Any, scratch: Scratch) -> None:
+def _finish(group: Group, steps: int, expects_flux: bool, scratch: Scratch) -> None:
     """Write the results and the flags of the lanes."""
     width, settings, lane_values, found = (
         width_of(group.lanes),

@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from faintspot.base.arrays import Array
 from faintspot.base.flags import SubapertureFlag
 from faintspot.slopes.kernels.compiling import compiled
 from faintspot.slopes.kernels.gather import gather_images, scatter_images
@@ -47,9 +48,9 @@ SETTING_ROWS = COMMON_ROWS + 8
 class GravityTables(NamedTuple):
     """Tables of the kernel; None, a separate type, for a step that is not compiled."""
 
-    flat_start: Any = None
+    flat_start: Array | None = None
     """From `flat_start_table`: images are denoised."""
-    algorithm: Any = None
+    algorithm: bool | None = None
     """Algorithm of the denoising, see `denoise_group`."""
     taps: Any = None
     """Taps of the smoothing along x and y, central tap first: (n_subapertures, 2, 1 + reach) float32."""
@@ -58,15 +59,15 @@ class GravityTables(NamedTuple):
 class GravityScratch(NamedTuple):
     """Memory of one thread: of the denoiser, and the lanes' values of denoiser and centroid."""
 
-    state: Any
+    state: Array
     """(STATE_VECTORS * pixels * W,)."""
-    rows: Any
+    rows: Array
     """(`row_vectors` * W,)."""
-    denoiser: Any
+    denoiser: Array
     """(denoise.LANE_ROWS * W,)."""
-    counts: Any
+    counts: Array
     """(denoise.COUNT_ROWS * W,) int64."""
-    centroid: Any
+    centroid: Array
 
 
 def gravity_scratch(lanes: Lanes, ny: int, nx: int) -> GravityScratch:
@@ -82,7 +83,7 @@ def gravity_scratch(lanes: Lanes, ny: int, nx: int) -> GravityScratch:
 
 
 @compiled
-def locate_gravity(group: Group, tables: GravityTables, scratch: Scratch, stages: Any) -> None:
+def locate_gravity(group: Group, tables: GravityTables, scratch: Scratch, stages: Array) -> None:
     """Find the centres of gravity of a group; an estimator's own kernel of `groups.measure_groups`."""
     lanes, ny, nx, first, settings = group.lanes, group.ny, group.nx, group.first, group.settings
     width, own = width_of(lanes), scratch.own
@@ -107,8 +108,14 @@ def locate_gravity(group: Group, tables: GravityTables, scratch: Scratch, stages
 
 @compiled
 def _first_step(
-    flat_start: Any, algorithm: Any, taps: Any, group: Group, image: Any, output: Any, own: Any
-) -> Any:
+    flat_start: Array | None,
+    algorithm: bool | None,
+    taps: Array | None,
+    group: Group,
+    image: Array,
+    output: Array,
+    own: GravityScratch,
+) -> Array:
     """Denoise or smooth the images where there are tables for it; return where the result is."""
     lanes, ny, nx = group.lanes, group.ny, group.nx
     if flat_start is not None:
@@ -123,7 +130,9 @@ def _first_step(
 
 
 @compiled
-def _locate_with_error(taps: Any, group: Group, image: Any, denoised: Any, own: Any) -> None:
+def _locate_with_error(
+    taps: Array | None, group: Group, image: Array, denoised: Array, own: GravityScratch
+) -> None:
     """Write the centre of gravity of a denoised image, and its errors."""
     lanes, ny, nx = group.lanes, group.ny, group.nx
     variances, place = group.variances, group.first * ny * nx
@@ -134,7 +143,9 @@ def _locate_with_error(taps: Any, group: Group, image: Any, denoised: Any, own: 
 
 
 @compiled
-def _read_settings(width: int, first: int, settings: Any, denoiser: Any, counts: Any, centroid: Any) -> None:
+def _read_settings(
+    width: int, first: int, settings: Array, denoiser: Array, counts: Array, centroid: Array
+) -> None:
     """Copy the settings of the lanes' sub-apertures."""
     for lane in range(width):
         s = min(first + lane, settings.shape[1] - 1)
@@ -153,7 +164,7 @@ def _read_settings(width: int, first: int, settings: Any, denoiser: Any, counts:
 
 
 @compiled
-def _set_threshold(lanes: Lanes, image: Any, pixels: Any, centroid: Any) -> None:
+def _set_threshold(lanes: Lanes, image: Array, pixels: int, centroid: Array) -> None:
     """Find THRESHOLD and LARGEST; without a RANK, THRESHOLD is given."""
     if centroid[brightest.RANK * width_of(lanes)] > 0.0:
         _find_threshold(lanes, image, pixels, centroid)
@@ -163,7 +174,14 @@ def _set_threshold(lanes: Lanes, image: Any, pixels: Any, centroid: Any) -> None
 
 @compiled
 def _flag_lane(
-    width: int, lane: int, ny: int, nx: int, first: int, settings: Any, own: Any, scratch: Scratch
+    width: int,
+    lane: int,
+    ny: int,
+    nx: int,
+    first: int,
+    settings: Array,
+    own: GravityScratch,
+    scratch: Scratch,
 ) -> None:
     """Write the bits of one lane's flags, and its iterations."""
     s = min(first + lane, settings.shape[1] - 1)
@@ -190,16 +208,16 @@ gravity_of_groups = driver_of(locate_gravity)
 @compiled
 def denoise_stack(
     lanes: Lanes,
-    images: Any,
-    window: Any,
+    images: Array,
+    window: tuple[int, int],
     settings: Any,
-    algorithm: Any,
-    lowers: Any,
-    table: Any,
+    algorithm: bool | None,
+    lowers: bool,
+    table: Array,
     start: int,
     stop: int,
     scratch: Scratch,
-    found: Any,
+    found: Array,
 ) -> None:
     """Denoise the groups [start, stop) of a stack of images (n, pixels) of a window (ny, nx).
 
@@ -231,7 +249,14 @@ def denoise_stack(
 
 @compiled
 def subtract_stack(
-    lanes: Lanes, images: Any, rank: Any, subtract: Any, start: int, stop: int, scratch: Scratch, result: Any
+    lanes: Lanes,
+    images: Array,
+    rank: Any,
+    subtract: Any,
+    start: int,
+    stop: int,
+    scratch: Scratch,
+    result: Array,
 ) -> None:
     """Brightest-pixel background subtraction of the groups [start, stop) of a stack (n, pixels)."""
     width = width_of(lanes)
@@ -250,7 +275,7 @@ def subtract_stack(
 
 @compiled
 def centroid_stack(
-    lanes: Lanes, images: Any, ny: int, nx: int, start: int, stop: int, scratch: Scratch, positions: Any
+    lanes: Lanes, images: Array, ny: int, nx: int, start: int, stop: int, scratch: Scratch, positions: Array
 ) -> None:
     """Centres of gravity of the groups [start, stop) of a stack (n, pixels), into (n, 2)."""
     width = width_of(lanes)

@@ -7,12 +7,14 @@ J = sum w^2 (VARIANCE + EXCESS m) dm dm', and that of the estimate I^-1 J I^-1, 
 """
 
 import math
-from typing import Any
 
+from faintspot.base.arrays import Array
 from faintspot.slopes.kernels.compiling import compiled
 from faintspot.slopes.kernels.groups import Group
 from faintspot.slopes.kernels.positions import spot_rows as row
 from faintspot.slopes.kernels.positions.spot_rows import (
+    ModelTables,
+    SpotScratch,
     eliminate_background,
     look_up,
     model_at,
@@ -38,7 +40,7 @@ LEAST_FLUX_E = 1e-2
 
 
 @compiled
-def _separable_sums(group: Group, image: Any, own: Any) -> None:
+def _separable_sums(group: Group, image: Array, own: SpotScratch) -> None:
     """Sum score, information and the score's covariance of every lane for a PSF of one separable term."""
     lanes, ny, nx, profiles, lane_values = group.lanes, group.ny, group.nx, own.profiles, own.lane_values
     width, place, padded = width_of(lanes), group.first * ny * nx, profiles.shape[3]
@@ -73,7 +75,7 @@ def _separable_sums(group: Group, image: Any, own: Any) -> None:
 
 
 @compiled
-def _general_sums(group: Group, image: Any, own: Any) -> None:
+def _general_sums(group: Group, image: Array, own: SpotScratch) -> None:
     """Sum as `_separable_sums`, for a PSF of several separable terms."""
     lanes, ny, nx, profiles, lane_values = group.lanes, group.ny, group.nx, own.profiles, own.lane_values
     width, place = width_of(lanes), group.first * ny * nx
@@ -101,7 +103,7 @@ def _general_sums(group: Group, image: Any, own: Any) -> None:
 
 
 @compiled
-def _move(lanes: Lanes, lane_values: Any) -> None:
+def _move(lanes: Lanes, lane_values: Array) -> None:
     """Make one step, within bounds."""
     width = width_of(lanes)
     zero, one, tiny = splat(lanes, 0.0), splat(lanes, 1.0), splat(lanes, 1e-20)
@@ -161,7 +163,7 @@ def _move(lanes: Lanes, lane_values: Any) -> None:
 
 
 @compiled
-def _store_errors(width: int, lane: int, flux: Any, lane_values: Any) -> None:
+def _store_errors(width: int, lane: int, flux: float, lane_values: Array) -> None:
     """Write what a lane's sums, made with light `flux`, say: the flux seen, standard errors and covariance.
 
     The covariance of x and y is A^-1 (J + prior) A^-1, A = I + prior.
@@ -204,7 +206,7 @@ def _store_errors(width: int, lane: int, flux: Any, lane_values: Any) -> None:
 
 
 @compiled
-def fit_group(group: Group, tables: Any, image: Any, own: Any) -> None:
+def fit_group(group: Group, tables: ModelTables, image: Array, own: SpotScratch) -> None:
     """Fit position and flux of the W spots of a group.
 
     Parameters

@@ -3,13 +3,15 @@
 import math
 from typing import Any
 
+from faintspot.base.arrays import Array
 from faintspot.slopes.kernels.compiling import compiled
 from faintspot.slopes.kernels.groups import Group
 from faintspot.slopes.kernels.positions import spot_rows as row
 from faintspot.slopes.kernels.positions.brightest import SMALLEST_VARIANCE, relative_variance, variance_of
-from faintspot.slopes.kernels.positions.spot_rows import look_up
+from faintspot.slopes.kernels.positions.spot_rows import ModelTables, PosteriorTables, SpotScratch, look_up
 from faintspot.slopes.kernels.simd import (
     Lanes,
+    Vector,
     absolute,
     copy_transposed,
     load,
@@ -27,7 +29,7 @@ LEAST_FRACTION = 0.05  # of the flux at the start: less under the weight would o
 
 
 @compiled
-def _move(group: Group, image: Any, floor: Any, own: Any) -> None:
+def _move(group: Group, image: Array, floor: Vector, own: SpotScratch) -> None:
     """Move every lane by the weighted centre of gravity of its image, seen from where it is."""
     lanes, ny, nx, profiles, lane_values = group.lanes, group.ny, group.nx, own.profiles, own.lane_values
     width, padded = width_of(lanes), profiles.shape[3]
@@ -60,7 +62,7 @@ def _move(group: Group, image: Any, floor: Any, own: Any) -> None:
 
 
 @compiled
-def _store_errors(group: Group, image: Any, floor: Any, own: Any) -> None:
+def _store_errors(group: Group, image: Array, floor: Vector, own: SpotScratch) -> None:
     """Propagate the pixels' noise, VARIANCE (or `variances`) + EXCESS * g, through the last step."""
     lanes, ny, nx, profiles, lane_values = group.lanes, group.ny, group.nx, own.profiles, own.lane_values
     width, place, padded = width_of(lanes), group.first * ny * nx, profiles.shape[3]
@@ -111,7 +113,7 @@ def _store_errors(group: Group, image: Any, floor: Any, own: Any) -> None:
 
 
 @compiled
-def weigh_group(group: Group, tables: Any, image: Any, own: Any) -> None:
+def weigh_group(group: Group, tables: ModelTables, image: Array, own: SpotScratch) -> None:
     """Follow the W spots of a group with a weight; parameters as `likelihood.fit_group`.
 
     The tables hold the weight's profile, 1 at its centre.
@@ -125,7 +127,7 @@ def weigh_group(group: Group, tables: Any, image: Any, own: Any) -> None:
 
 
 @compiled
-def rows_from_lanes(lanes: Lanes, image: Any, ny: int, nx: int, starts: Any, rows: Any) -> None:
+def rows_from_lanes(lanes: Lanes, image: Array, ny: int, nx: int, starts: Array, rows: Array) -> None:
     """Reorder a group's images.
 
     Parameters
@@ -159,13 +161,13 @@ _NEGLIGIBLE = 25.0  # differences of the logarithm that count as probability 0
 
 
 @compiled
-def _share(position: Any, spacing: Any, low: Any, high: Any) -> Any:
+def _share(position: float, spacing: float, low: float, high: float) -> float:
     """Return the fraction of a grid point's cell within the allowed positions."""
     return min(position + 0.5 * spacing, high) - max(position - 0.5 * spacing, low)
 
 
 @compiled
-def _log_likelihood(lanes: Lanes, rows: Any, lane: int, tables: Any, table: Any, position: Any) -> Any:
+def _log_likelihood(lanes: Lanes, rows: Array, lane: int, tables: Any, table: int, position: int) -> float:
     """Return the sum of the image times the table of a position."""
     width = width_of(lanes)
     count = rows.shape[0] * rows.shape[1]
@@ -184,7 +186,7 @@ def _log_likelihood(lanes: Lanes, rows: Any, lane: int, tables: Any, table: Any,
 
 
 @compiled
-def posterior_of_group(group: Group, tables: Any, image: Any, own: Any) -> None:
+def posterior_of_group(group: Group, tables: PosteriorTables, image: Array, own: SpotScratch) -> None:
     """Write mean, standard deviation and covariance of the posterior of the W spots of a group.
 
     Parameters

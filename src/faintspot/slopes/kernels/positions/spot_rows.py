@@ -1,13 +1,19 @@
 """Per-lane rows (n_rows, W) of estimators of a spot's position; profiles and model image of the spot."""
 
 import math
-from typing import Any
+from typing import NamedTuple
 
+import numpy as np
+
+from faintspot.base.arrays import Array
 from faintspot.slopes.kernels.compiling import compiled, inlined
 from faintspot.slopes.kernels.groups import Group
+from faintspot.slopes.kernels.host import aligned_zeros
 from faintspot.slopes.kernels.positions.brightest import smooth_pixel, variance_of, weight_variance_of
 from faintspot.slopes.kernels.simd import (
     Lanes,
+    Pair,
+    Vector,
     copy_transposed,
     load,
     maximum,
@@ -48,8 +54,74 @@ LARGEST_MOVE, MOVE, MOVE_BEFORE = range(49, 52)
 LANE_ROWS = 52
 
 
+class ModelTables(NamedTuple):
+    """Tables of the kernels that use a profile: weighted and fitted estimators."""
+
+    steps: int
+    round_electrons: bool
+    """Whether images are rounded to whole electrons."""
+    background: bool
+    """Whether a constant is fitted along with the spot."""
+    taps: Array
+    """(n_subapertures, 2, 1 + reach) float32: of the smoothing that finds the start."""
+    model: Array
+    """(n_models, 2, rank, 2, PHASES, length) float32: see `look_up`."""
+
+
+class PosteriorTables(NamedTuple):
+    """Tables of the kernel that starts from the mean of the posterior."""
+
+    fit: ModelTables
+    """ModelTables."""
+    logarithms: Array
+    """(n_tables, n_positions, ny, n_vectors * W) float32: k_p of each table and position, 0 beyond nx."""
+    constants: Array
+    """(n_tables, n_positions) float32: c_p."""
+    grid: Array
+    """(n_positions, 2) float32: x and y, px."""
+    spacing: float
+    """Spacing of the grid, px."""
+
+
+class SpotScratch(NamedTuple):
+    """Memory of one thread."""
+
+    taps: Array
+    lane_values: Array
+    """(LANE_ROWS * W,)."""
+    profiles: Array
+    """(2, rank, 2, padded, W): of the first nx or ny of `padded` pixels."""
+    rows: Array
+    """(ny, n_vectors, W, W)."""
+    logarithms: Array
+    """(n_positions,) float64."""
+    starts: Array
+    """(W,) int64: free for any use."""
+    models: Array
+    """(W,) int64: model of each lane in `ModelTables.model`."""
+    kinds: Array
+    """(W,) int64: table of each lane in `PosteriorTables.logarithms`."""
+
+
+def spot_scratch(
+    lanes: Lanes, ny: int, nx: int, rank: int = 1, taps: int = 1, positions: int = 0
+) -> SpotScratch:
+    """Return the kernels' own memory, for models of a rank, a number of taps and of a grid's positions."""
+    width = lanes.width
+    vectors = -(-nx // width)
+    padded = -(-max(ny, nx) // width) * width
+    return SpotScratch(
+        aligned_zeros(2 * taps * width, lanes.dtype),
+        aligned_zeros(LANE_ROWS * width, lanes.dtype),
+        aligned_zeros(4 * rank * padded * width, lanes.dtype).reshape(2, rank, 2, padded, width),
+        aligned_zeros(ny * vectors * width * width, lanes.dtype).reshape(ny, vectors, width, width),
+        np.zeros(positions),
+        *(np.zeros(width, np.int64) for _ in range(3)),
+    )
+
+
 @inlined
-def model_at(lanes: Lanes, profiles: Any, x: Any, y: Any) -> Any:
+def model_at(lanes: Lanes, profiles: Array, x: int, y: int) -> tuple[Vector, Vector, Vector]:
     """Return the PSF, a sum of separable terms, and its derivatives along x and y, at one pixel."""
     width, rank, padded = width_of(lanes), profiles.shape[1], profiles.shape[3]
     m = mx = my = splat(lanes, 0.0)
@@ -63,7 +135,7 @@ def model_at(lanes: Lanes, profiles: Any, x: Any, y: Any) -> Any:
 
 
 @inlined
-def noise_of(lanes: Lanes, lane_values: Any) -> Any:
+def noise_of(lanes: Lanes, lane_values: Array) -> tuple[Vector, Vector, Vector, Vector, Vector]:
     """Return the numbers of the lanes that `weigh` needs."""
     width = width_of(lanes)
     v, e = load(lanes, lane_values, VARIANCE * width), load(lanes, lane_values, EXCESS * width)
@@ -73,7 +145,13 @@ def noise_of(lanes: Lanes, lane_values: Any) -> Any:
 
 
 @inlined
-def weigh(lanes: Lanes, noise: Any, variances: Any, at: Any, m: Any) -> Any:
+def weigh(
+    lanes: Lanes,
+    noise: tuple[Vector, Vector, Vector, Vector, Vector],
+    variances: Array | None,
+    at: int,
+    m: Vector,
+) -> Pair:
     """Return the weight w of the pixel at element `at`, of which the model is m, and w times its variance."""
     v, e, wv, we, model_error = noise
     expected = maximum(m, splat(lanes, 0.0))
@@ -86,7 +164,7 @@ _LEAST_LEFT = 1e-5  # of the information on the flux: below it is round-off, and
 
 
 @compiled
-def subtract_background(lanes: Lanes, image: Any, pixels: Any, flux: Any) -> None:
+def subtract_background(lanes: Lanes, image: Array, pixels: int, flux: Vector) -> None:
     """Subtract from every lane's image the constant that leaves it `flux` (a vector, electrons)."""
     width = width_of(lanes)
     even, odd = splat(lanes, 0.0), splat(lanes, 0.0)  # neither addition waits for the other
@@ -101,7 +179,7 @@ def subtract_background(lanes: Lanes, image: Any, pixels: Any, flux: Any) -> Non
 
 
 @compiled
-def eliminate_background(group: Group, image: Any, own: Any) -> None:
+def eliminate_background(group: Group, image: Array, own: SpotScratch) -> None:
     """Turn the sums of a fit of x, y and the flux into those of a fit that has a constant as well.
 
     Parameters as `likelihood.fit_group`; SCORE_*, I_* and J_* are read and written.
@@ -147,7 +225,7 @@ def eliminate_background(group: Group, image: Any, own: Any) -> None:
 
 
 @compiled
-def _add(lanes: Lanes, lane_values: Any, row: Any, change: Any) -> None:
+def _add(lanes: Lanes, lane_values: Array, row: int, change: Vector) -> None:
     """Add to a row."""
     at = row * width_of(lanes)
     store(lane_values, at, load(lanes, lane_values, at) + change)
@@ -158,7 +236,7 @@ MARGIN = 2  # px that a table reaches beyond the window's side, on either end
 
 
 @compiled
-def look_up(group: Group, tables: Any, own: Any) -> None:
+def look_up(group: Group, tables: Array, own: SpotScratch) -> None:
     """Write every lane's profiles, and their derivatives in the position, at its position X, Y.
 
     Parameters
@@ -207,7 +285,7 @@ LEAST_FLUX_E = 1.0  # an estimate of the flux below this says nothing
 
 
 @compiled
-def _pixel_range(lanes: Lanes, lane_values: Any, low: Any, high: Any, n: Any) -> Any:
+def _pixel_range(lanes: Lanes, lane_values: Array, low: int, high: int, n: int) -> tuple[int, int]:
     """First and last pixel whose centre is within half a pixel of some lane's allowed positions."""
     width = width_of(lanes)
     first, last = n - 1, 0
@@ -220,7 +298,7 @@ def _pixel_range(lanes: Lanes, lane_values: Any, low: Any, high: Any, n: Any) ->
 
 @compiled
 def find_start(
-    lanes: Lanes, image: Any, ny: int, nx: int, reach: Any, taps: Any, smoothed: Any, lane_values: Any
+    lanes: Lanes, image: Array, ny: int, nx: int, reach: int, taps: Array, smoothed: Array, lane_values: Array
 ) -> None:
     """Write X, Y and FLUX of every lane: its largest smoothed pixel within the allowed positions.
 

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from faintspot.base.arrays import Array
 from faintspot.base.checks import LARGEST_FLOAT32
 from faintspot.slopes.kernels import groups
 from faintspot.slopes.kernels.compiling import compiled
@@ -62,31 +63,31 @@ LEAST_SIGNIFICANCE = 1.0
 class WindowTables(NamedTuple):
     """Tables that the kernel reads in addition to the settings."""
 
-    weights: Any
+    weights: Array
     """(n_groups, rows, columns, 3, W) float32: of the pixels that count."""
-    top: Any
+    top: int
     """First row of those."""
-    left: Any
-    rows: Any
-    columns: Any
+    left: int
+    rows: int
+    columns: int
 
 
 class RowTables(NamedTuple):
     """The same, of pixels that lie side by side in the frame."""
 
-    pixels: Any
+    pixels: Lanes
     """Lanes: of pixels in a row."""
-    weights: Any
+    weights: Array
     """(n_subapertures, rows, vectors, 3, W) float32: for pixels in ADU; 0 in those that do not count."""
-    level: Any
+    level: Array
     """(n_subapertures,) float32: taken off every pixel first, so that nothing is lost in large sums."""
-    dark: Any
+    dark: Array
     """(n_subapertures, 3) float32: sums that the dark gives above the level."""
-    bad: Any
+    bad: Array
     """(n_subapertures,) bool: whether a pixel that counts is masked."""
-    top: Any
-    left: Any
-    gathered: Any
+    top: int
+    left: int
+    gathered: WindowTables
     """WindowTables, for groups with bad pixels."""
 
 
@@ -96,7 +97,7 @@ def no_scratch(lanes: Lanes, ny: int, nx: int) -> tuple[Any, ...]:
 
 
 @compiled
-def locate_window(group: Group, tables: Any, scratch: Scratch, stages: Any) -> None:
+def locate_window(group: Group, tables: WindowTables, scratch: Scratch, stages: Array) -> None:
     """Sum the images of a group under their weights."""
     lanes, nx, image, found = group.lanes, group.nx, scratch.image, scratch.results
     width = width_of(lanes)
@@ -134,7 +135,7 @@ def locate_window(group: Group, tables: Any, scratch: Scratch, stages: Any) -> N
 
 
 @compiled
-def _solved(settings: Any, s: int, sum_x: Any, sum_y: Any, seen: Any) -> Any:
+def _solved(settings: Array, s: int, sum_x: float, sum_y: float, seen: float) -> Any:
     """Return position, flux, standard errors, covariance, and whether they are good for anything."""
     divisor = settings[DIVISOR, s]
     flux = divisor
@@ -159,7 +160,7 @@ window_of_groups = driver_of(locate_window)
 
 
 @compiled
-def _measure(source: Source, tables: Any, f: int, s: int, settings: Any, slopes: SlopeArrays) -> Any:
+def _measure(source: Source, tables: RowTables, f: int, s: int, settings: Array, slopes: SlopeArrays) -> bool:
     """Measure one sub-aperture; False, and nothing written, where a pixel that counts is bad."""
     if tables.bad[s]:
         return False
@@ -200,7 +201,7 @@ def _measure(source: Source, tables: Any, f: int, s: int, settings: Any, slopes:
 
 @compiled
 def window_in_rows(
-    source: Source, task: Task, start: int, stop: int, scratch: Any, slopes: SlopeArrays, stages: Any
+    source: Source, task: Task, start: int, stop: int, scratch: Scratch, slopes: SlopeArrays, stages: Array
 ) -> None:
     """Compute the slopes of the groups [start, stop) of a block of frames; see `groups.measure_groups`."""
     width, n = width_of(source.lanes), source.corners.shape[0]

@@ -9,11 +9,13 @@ References: Chambolle 2004 (J. Math. Imaging Vis. 20, 89), Beck & Teboulle 2009 
 """
 
 import math
-from typing import Any
+from typing import TYPE_CHECKING
 
+from faintspot.base.arrays import Array
 from faintspot.slopes.kernels.compiling import compiled
 from faintspot.slopes.kernels.simd import (
     Lanes,
+    Vector,
     load,
     maximum,
     minimum,
@@ -32,6 +34,9 @@ from faintspot.slopes.kernels.total_variation.sweeps import (
     sweep_fgp,
     twice_divergence,
 )
+
+if TYPE_CHECKING:
+    from faintspot.slopes.kernels.positions.gravity import GravityScratch
 
 # Iterations between two convergence tests, which compare the images of both. Where a wide, shallow residue is
 # left, a single iteration changes little. A group goes on until its slowest lane has finished.
@@ -64,7 +69,14 @@ def row_vectors(ny: int, nx: int) -> int:
 
 @compiled
 def _measure_change(
-    lanes: Lanes, state: Any, rows: Any, ny: int, nx: int, current: Any, inverse: Any, lane_values: Any
+    lanes: Lanes,
+    state: Array,
+    rows: Array,
+    ny: int,
+    nx: int,
+    current: int,
+    inverse: Vector,
+    lane_values: Array,
 ) -> None:
     """Sum ||div p - div p_then||^2 and ||div p - g / lambda||^2 per lane, both times 4, since the last test.
 
@@ -92,7 +104,7 @@ def _measure_change(
 
 @compiled
 def _write_finished(
-    lanes: Lanes, state: Any, rows: Any, output: Any, ny: int, nx: int, current: Any, lane_values: Any
+    lanes: Lanes, state: Array, rows: Array, output: Array, ny: int, nx: int, current: int, lane_values: Array
 ) -> None:
     """Write u = g - lambda div p of the lanes that finish now, with lambda such that the constraint holds."""
     width = width_of(lanes)
@@ -120,7 +132,7 @@ def _write_finished(
 
 @compiled
 def _prepare(
-    lanes: Lanes, image: Any, state: Any, ny: int, nx: int, smallest_range: Any, lane_values: Any
+    lanes: Lanes, image: Array, state: Array, ny: int, nx: int, smallest_range: float, lane_values: Array
 ) -> None:
     """Normalise the images into the state.
 
@@ -155,7 +167,7 @@ def _prepare(
 
 
 @compiled
-def _copy_lane(width: int, lane: int, pixels: Any, image: Any, output: Any) -> None:
+def _copy_lane(width: int, lane: int, pixels: int, image: Array, output: Array) -> None:
     for i in range(lane, pixels * width, width):
         output[i] = image[i]
 
@@ -163,14 +175,14 @@ def _copy_lane(width: int, lane: int, pixels: Any, image: Any, output: Any) -> N
 @compiled
 def _decide_beforehand(
     width: int,
-    pixels: Any,
-    smallest: Any,
-    lowers: Any,
-    image: Any,
-    output: Any,
-    lane_values: Any,
-    counts: Any,
-) -> Any:
+    pixels: int,
+    smallest: float,
+    lowers: bool,
+    image: Array,
+    output: Array,
+    lane_values: Array,
+    counts: Array,
+) -> int:
     """Settle the lanes that need no iteration; return how many remain active.
 
     Constant images and strength zero (or below the rounding error of the image) return the image itself;
@@ -213,7 +225,7 @@ def _decide_beforehand(
 
 
 @compiled
-def _next_limit(width: int, counts: Any) -> Any:
+def _next_limit(width: int, counts: Array) -> int:
     """The smallest iteration limit among the active lanes."""
     limit = 1 << 62
     for lane in range(width):
@@ -223,7 +235,7 @@ def _next_limit(width: int, counts: Any) -> Any:
 
 
 @compiled
-def _mark_finished(width: int, iteration: Any, tested: Any, lane_values: Any, counts: Any) -> Any:
+def _mark_finished(width: int, iteration: int, tested: int, lane_values: Array, counts: Array) -> int:
     """Mark the active lanes that have converged or reached their limit; return how many."""
     finished = 0
     for lane in range(width):
@@ -245,7 +257,14 @@ def _mark_finished(width: int, iteration: Any, tested: Any, lane_values: Any, co
 
 @compiled
 def denoise_group(
-    lanes: Lanes, algorithm: Any, lowers: Any, table: Any, window: Any, image: Any, output: Any, own: Any
+    lanes: Lanes,
+    algorithm: bool | None,
+    lowers: bool,
+    table: Array,
+    window: tuple[int, int],
+    image: Array,
+    output: Array,
+    own: "GravityScratch",
 ) -> None:
     """Denoise the W images of a group.
 

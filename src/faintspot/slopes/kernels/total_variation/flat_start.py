@@ -16,10 +16,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
+from faintspot.base.arrays import Array
 from faintspot.slopes.kernels.compiling import compiled, inlined
-from faintspot.slopes.kernels.groups import Source
 from faintspot.slopes.kernels.simd import (
     Lanes,
+    Pair,
+    Vector,
     get,
     load,
     maximum,
@@ -63,12 +65,12 @@ def flat_start_table(ny: int, nx: int, dtype: DTypeLike = np.float32) -> NDArray
 
 
 @inlined
-def _product(lanes: Lanes, table: Any, entry: Any, vectors: Any, place: Any, total: Any) -> Any:
+def _product(lanes: Lanes, table: Array, entry: int, vectors: Array, place: int, total: Vector) -> Vector:
     return multiply_add(splat(lanes, get(table, entry)), load(lanes, vectors, place), total)
 
 
 @compiled
-def _transform_row(lanes: Lanes, rows: Any, nx: int, table: Any, pairs: Any, to: Any) -> None:
+def _transform_row(lanes: Lanes, rows: Array, nx: int, table: Array, pairs: int, to: int) -> None:
     """Cosine transform of a row given as sums and differences of mirrored pixels, from place `pairs`."""
     width = width_of(lanes)
     zero, half = splat(lanes, 0.0), (nx + 1) // 2
@@ -96,7 +98,7 @@ def _transform_row(lanes: Lanes, rows: Any, nx: int, table: Any, pairs: Any, to:
 
 
 @compiled
-def _transform_back(lanes: Lanes, rows: Any, nx: int, table: Any, source: Source, to: Any) -> None:
+def _transform_back(lanes: Lanes, rows: Array, nx: int, table: Array, source: int, to: int) -> None:
     """Turn the cosine transform of a row back into the row."""
     width = width_of(lanes)
     zero, half = splat(lanes, 0.0), (nx + 1) // 2
@@ -132,7 +134,7 @@ def _transform_back(lanes: Lanes, rows: Any, nx: int, table: Any, source: Source
 
 
 @inlined
-def _store_mirrored(lanes: Lanes, rows: Any, nx: int, to: Any, i: Any, even: Any, odd: Any) -> None:
+def _store_mirrored(lanes: Lanes, rows: Array, nx: int, to: int, i: int, even: Vector, odd: Vector) -> None:
     """Store pixel i of a row and its mirror image; in the middle of a row, what is odd is zero."""
     width = width_of(lanes)
     store(rows, to + (nx - 1 - i) * width, even - odd)
@@ -140,7 +142,7 @@ def _store_mirrored(lanes: Lanes, rows: Any, nx: int, to: Any, i: Any, even: Any
 
 
 @compiled
-def _solve_laplace(lanes: Lanes, state: Any, rows: Any, ny: int, nx: int, table: Any) -> None:
+def _solve_laplace(lanes: Lanes, state: Array, rows: Array, ny: int, nx: int, table: Array) -> None:
     """Write phi, whose Laplacian is the image in the state, into the first ny * nx vectors of `rows`."""
     width = width_of(lanes)
     half, pivots = (nx + 1) // 2, nx * ((nx + 1) // 2)
@@ -169,7 +171,7 @@ def _solve_laplace(lanes: Lanes, state: Any, rows: Any, ny: int, nx: int, table:
 
 
 @inlined
-def _field(lanes: Lanes, rows: Any, y: Any, x: Any, ny: int, nx: int, twice_inverse: Any) -> Any:
+def _field(lanes: Lanes, rows: Array, y: int, x: int, ny: int, nx: int, twice_inverse: Vector) -> Pair:
     """2 grad phi / lambda at one pixel."""
     width = width_of(lanes)
     here = (y * nx + x) * width
@@ -180,7 +182,7 @@ def _field(lanes: Lanes, rows: Any, y: Any, x: Any, ny: int, nx: int, twice_inve
 
 
 @compiled
-def _norm_and_slope(lanes: Lanes, rows: Any, ny: int, nx: int, twice_inverse: Any) -> Any:
+def _norm_and_slope(lanes: Lanes, rows: Array, ny: int, nx: int, twice_inverse: Vector) -> Pair:
     """Squared norm of 2 div p, p cut to length 1, and its product with what is not cut off from it."""
     width = width_of(lanes)
     zero, four = splat(lanes, 0.0), splat(lanes, 4.0)
@@ -208,7 +210,9 @@ def _norm_and_slope(lanes: Lanes, rows: Any, ny: int, nx: int, twice_inverse: An
 
 
 @compiled
-def start_flat(lanes: Lanes, state: Any, rows: Any, ny: int, nx: int, table: Any, inverse_radius: Any) -> Any:
+def start_flat(
+    lanes: Lanes, state: Array, rows: Array, ny: int, nx: int, table: Array, inverse_radius: Vector
+) -> Vector:
     """Write 2 p of the start into the state's first version; return 1 / lambda to go on with.
 
     The multiplier is one Newton step from the first guess towards the one for which the field obeys the

@@ -14,9 +14,12 @@ References: Chambolle 2004 (J. Math. Imaging Vis. 20, 89), Beck & Teboulle 2009 
 
 from typing import Any
 
+from faintspot.base.arrays import Array
 from faintspot.slopes.kernels.compiling import compiled, inlined, vector_registers
 from faintspot.slopes.kernels.simd import (
     Lanes,
+    Pair,
+    Vector,
     align_stack,
     load,
     maximum,
@@ -36,8 +39,16 @@ CHAMBOLLE_STEP = 0.25
 EXTRAPOLATES_AHEAD = vector_registers() >= 32
 
 
+Factors = tuple[Vector, Vector, Vector]
+"""Momentum, -2 FGP_STEP / lambda, and FGP_STEP."""
+Carried = tuple[Any, ...]
+"""Norm, v above, what is extrapolated ahead, values at the left and place behind, for the next column."""
+
+
 @inlined
-def _extrapolate(lanes: Lanes, state: Any, place: Any, current: Any, previous: Any, momentum: Any) -> Any:
+def _extrapolate(
+    lanes: Lanes, state: Array, place: int, current: int, previous: int, momentum: Vector
+) -> Pair:
     """Extrapolate: q = p + momentum * (p - p_previous) at one pixel."""
     width = width_of(lanes)
     px = load(lanes, state, place + current)
@@ -48,7 +59,9 @@ def _extrapolate(lanes: Lanes, state: Any, place: Any, current: Any, previous: A
 
 
 @inlined
-def _extrapolate_pair(lanes: Lanes, state: Any, place: Any, line: Any, versions: Any, momentum: Any) -> Any:
+def _extrapolate_pair(
+    lanes: Lanes, state: Array, place: int, line: int, versions: tuple[int, int], momentum: Vector
+) -> tuple[Vector, Vector, Vector, Vector]:
     """Extrapolate one pixel of the upper row and the pixel below it."""
     qx, qy = _extrapolate(lanes, state, place, versions[0], versions[1], momentum)
     rx, ry = _extrapolate(lanes, state, place + line, versions[0], versions[1], momentum)
@@ -56,7 +69,7 @@ def _extrapolate_pair(lanes: Lanes, state: Any, place: Any, line: Any, versions:
 
 
 @inlined
-def store_projected(lanes: Lanes, state: Any, target: Any, px: Any, py: Any) -> None:
+def store_projected(lanes: Lanes, state: Array, target: int, px: Vector, py: Vector) -> None:
     """Store the nearest dual vector of length at most two."""
     bounded_square = maximum(multiply_add(px, px, py * py), splat(lanes, 4.0))
     shrink = twice_reciprocal_square_root(bounded_square)
@@ -67,17 +80,17 @@ def store_projected(lanes: Lanes, state: Any, target: Any, px: Any, py: Any) -> 
 @inlined
 def _turn(
     lanes: Lanes,
-    state: Any,
-    rows: Any,
-    x: Any,
-    places: Any,
-    line: Any,
-    versions: Any,
-    factors: Any,
-    top: Any,
-    left_edge: Any,
-    carried: Any,
-) -> Any:
+    state: Array,
+    rows: Array,
+    x: int,
+    places: tuple[int, int],
+    line: int,
+    versions: tuple[int, int],
+    factors: Factors,
+    top: bool,
+    left_edge: bool,
+    carried: Carried,
+) -> Carried:
     """Process one column of a pair of rows; return the values that the next turn needs.
 
     Extrapolate this column, or the next one where there are registers to keep it in; complete v of this
@@ -126,7 +139,7 @@ def _turn(
 
 
 @inlined
-def _no_work(lanes: Lanes, norm: Any, place: Any) -> Any:
+def _no_work(lanes: Lanes, norm: Vector, place: int) -> Carried:
     """Return the initial `carried`: its first update, of zero at `place`, is overwritten later."""
     zero = splat(lanes, 0.0)
     return norm, zero, (zero, zero, zero, zero), (zero, zero, zero, zero, zero), place
@@ -134,8 +147,16 @@ def _no_work(lanes: Lanes, norm: Any, place: Any) -> Any:
 
 @inlined
 def _sweep_pair(
-    lanes: Lanes, state: Any, rows: Any, y: Any, nx: int, versions: Any, factors: Any, top: Any, carried: Any
-) -> Any:
+    lanes: Lanes,
+    state: Array,
+    rows: Array,
+    y: int,
+    nx: int,
+    versions: tuple[int, int],
+    factors: Factors,
+    top: bool,
+    carried: Carried,
+) -> Carried:
     """All turns of rows y and y + 1, `top` when y = 0; `rows`: those of row y - 1, then of row y + 1."""
     width = width_of(lanes)
     pixel, line = STATE_VECTORS * width, nx * STATE_VECTORS * width
@@ -158,7 +179,7 @@ def _sweep_pair(
 
 
 @inlined
-def _finish(lanes: Lanes, state: Any, previous: Any, carried: Any) -> Any:
+def _finish(lanes: Lanes, state: Array, previous: int, carried: Carried) -> Vector:
     """Update p in the rightmost pixel of the last pair's upper row; return the norm."""
     norm, _, _, (ax, ay, av, _, bv), behind = carried
     store_projected(lanes, state, behind + previous, ax, (bv - av) + ay)
@@ -166,7 +187,9 @@ def _finish(lanes: Lanes, state: Any, previous: Any, carried: Any) -> Any:
 
 
 @inlined
-def _first_row(lanes: Lanes, state: Any, rows: Any, nx: int, versions: Any, factors: Any) -> Any:
+def _first_row(
+    lanes: Lanes, state: Array, rows: Array, nx: int, versions: tuple[int, int], factors: Factors
+) -> Vector:
     """Put the first row into `rows`; return the norm."""
     width = width_of(lanes)
     momentum, minus_inverse, step = factors
@@ -186,7 +209,7 @@ def _first_row(lanes: Lanes, state: Any, rows: Any, nx: int, versions: Any, fact
 
 
 @inlined
-def _update_last_row(lanes: Lanes, state: Any, rows: Any, target: Any, nx: int) -> None:
+def _update_last_row(lanes: Lanes, state: Array, rows: Array, target: int, nx: int) -> None:
     """Update p of the row in `rows`, the image's last: no gradient across the lower edge, py stays zero."""
     width = width_of(lanes)
     zero, v = splat(lanes, 0.0), load(lanes, rows, 2 * width)
@@ -200,8 +223,8 @@ def _update_last_row(lanes: Lanes, state: Any, rows: Any, target: Any, nx: int) 
 
 @compiled
 def sweep_fgp(
-    lanes: Lanes, state: Any, rows: Any, ny: int, nx: int, current: Any, momentum: Any, inverse: Any
-) -> Any:
+    lanes: Lanes, state: Array, rows: Array, ny: int, nx: int, current: int, momentum: Vector, inverse: Vector
+) -> Vector:
     """Make one accelerated projected-gradient iteration on each pixel; return ||div q||^2 per lane.
 
     `current` (0 or 2) is the position of the current p; the new p replaces the other version. `inverse`
@@ -232,7 +255,9 @@ def sweep_fgp(
 
 
 @compiled
-def sweep_chambolle(lanes: Lanes, state: Any, rows: Any, ny: int, nx: int, current: Any, inverse: Any) -> Any:
+def sweep_chambolle(
+    lanes: Lanes, state: Array, rows: Array, ny: int, nx: int, current: int, inverse: Vector
+) -> Vector:
     """Make one "chambolle" iteration on each pixel; return ||div p||^2 per lane, of the new p.
 
     With the norm of the previous p, one iteration late, the multiplier would oscillate near
@@ -272,8 +297,8 @@ def sweep_chambolle(lanes: Lanes, state: Any, rows: Any, ny: int, nx: int, curre
 
 @compiled
 def twice_divergence(
-    lanes: Lanes, state: Any, place: Any, version: Any, y: Any, x: Any, line: Any, pixel: Any
-) -> Any:
+    lanes: Lanes, state: Array, place: int, version: int, y: int, x: int, line: int, pixel: int
+) -> Vector:
     """2 div p at one pixel, of the version of p that starts `version` elements after the pixel."""
     width = width_of(lanes)
     d = load(lanes, state, place + version) + load(lanes, state, place + version + width)

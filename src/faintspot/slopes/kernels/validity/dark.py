@@ -5,16 +5,29 @@ the noise that the borders of windows show in the same frame, so that neither ga
 """
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
+from faintspot.base.arrays import Array
 from faintspot.base.checks import LARGEST_FLOAT32
 from faintspot.base.flags import UNMEASURED, SubapertureFlag
 from faintspot.slopes.kernels.compiling import compiled, inlined
 from faintspot.slopes.kernels.gather import Frames, pixels_of
 from faintspot.slopes.kernels.groups import SlopeArrays
-from faintspot.slopes.kernels.simd import absolute, get, load, maximum, select, splat, store, sum_of, width_of
+from faintspot.slopes.kernels.simd import (
+    Lanes,
+    Vector,
+    absolute,
+    get,
+    load,
+    maximum,
+    select,
+    splat,
+    store,
+    sum_of,
+    width_of,
+)
 
 _UNMEASURED = int(UNMEASURED)
 _NO_FLUX = int(SubapertureFlag.NO_FLUX)
@@ -40,28 +53,28 @@ _ABSOLUTE_TO_STD = 0.5 * math.sqrt(math.pi)  # of the mean absolute difference o
 class LightTest(NamedTuple):
     """Windows of a sensor, and the limit that makes them dark."""
 
-    lanes: Any
+    lanes: Lanes
     """Lanes: pixels of a row, at most as many as a window has."""
-    last: Any
+    last: Array
     """(W,) float32: 1 in the pixels of the last vector of a row that the one before does not hold, else 0."""
-    maps: Any
+    maps: Array
     """(2, h, w) float32: dark in ADU, and electrons per ADU (NaN in bad pixels), of each pixel of a frame."""
-    corners: Any
+    corners: Array
     """(n, 2) int64: row and column of every window's first pixel."""
-    window: Any
+    window: tuple[int, int]
     """Its height and width, (ny, nx)."""
-    box: Any
+    box: int
     """Side of the box, px; 0: no test."""
-    limit: Any
+    limit: np.float32
     """Significance that a dark window exceeds once in a thousand times."""
-    unit: Any
+    unit: np.float32
     """Standard deviation of a box above the border, in units of a pixel's."""
-    dark: Any
+    dark: Array
     """Numbers of the sub-apertures that are known to be dark in all frames, int64."""
 
 
 @compiled
-def flag_dark(test: LightTest, frames: Frames, slopes: SlopeArrays, scratch: Any) -> None:
+def flag_dark(test: LightTest, frames: Frames, slopes: SlopeArrays, scratch: Array) -> None:
     """Flag dark sub-apertures NO_FLUX: known ones, and those that bright frames show; slopes become 0.
 
     A frame is bright if its typical spots are so significant that a much fainter one would be seen.
@@ -103,7 +116,7 @@ def scratch_size(ny: int, nx: int) -> int:
 
 
 @compiled
-def _typical_flux(flux: Any, flags: Any, scratch: Any) -> Any:
+def _typical_flux(flux: Array, flags: Array, scratch: Array) -> np.float32:
     """Return the flux that about a tenth of the sub-apertures exceed; their numbers begin `scratch`.
 
     It is that of `GAUGES` of at most `SAMPLED` sub-apertures, evenly spread; -1 without any.
@@ -138,7 +151,7 @@ def _typical_flux(flux: Any, flags: Any, scratch: Any) -> Any:
 
 
 @compiled
-def _is_bright(test: LightTest, frames: Frames, f: int, noise: Any, scratch: Any) -> Any:
+def _is_bright(test: LightTest, frames: Frames, f: int, noise: float, scratch: Array) -> bool:
     """Return whether most of the typical spots, whose numbers begin `scratch`, are bright."""
     bright = total = 0
     for i in range(GAUGES):
@@ -160,7 +173,7 @@ def _make_dark(f: int, s: int, slopes: SlopeArrays) -> None:
 
 
 @compiled
-def significances(test: LightTest, frames: Frames, found: Any, scratch: Any) -> None:
+def significances(test: LightTest, frames: Frames, found: Array, scratch: Array) -> None:
     """Write the significance of the flux of each window of a frame (1, h, w), infinite without noise: (n,).
 
     `scratch` has `scratch_size` numbers or more.
@@ -172,7 +185,7 @@ def significances(test: LightTest, frames: Frames, found: Any, scratch: Any) -> 
 
 
 @compiled
-def add_windows(test: LightTest, frames: Frames, start: int, stop: int, weight: Any, mean: Any) -> None:
+def add_windows(test: LightTest, frames: Frames, start: int, stop: int, weight: float, mean: Array) -> None:
     """Add windows [start, stop) of a frame (1, h, w) to their running means, (n * ny, nx) float32 [ADU].
 
     Parameters
@@ -196,7 +209,9 @@ def add_windows(test: LightTest, frames: Frames, start: int, stop: int, weight: 
 
 
 @compiled
-def frame_noise(test: LightTest, frames: Frames, f: int, windows: Any, flags: Any, scratch: Any) -> Any:
+def frame_noise(
+    test: LightTest, frames: Frames, f: int, windows: int, flags: Array, scratch: Array
+) -> np.float32:
     """Return the noise of a pixel, from differences of pixels along the borders of some windows.
 
     It is the median over windows, evenly spread, of which each has the mean absolute difference of its first
@@ -223,7 +238,7 @@ def frame_noise(test: LightTest, frames: Frames, f: int, windows: Any, flags: An
 
 
 @compiled
-def _border_difference(test: LightTest, frames: Frames, f: int, s: int) -> Any:
+def _border_difference(test: LightTest, frames: Frames, f: int, s: int) -> np.float32:
     """Return the mean absolute difference of a window's two first and two last rows; -1 without any."""
     lanes, row, column = test.lanes, test.corners[s, 0], test.corners[s, 1]
     width, (ny, nx) = width_of(lanes), test.window
@@ -245,7 +260,7 @@ def _border_difference(test: LightTest, frames: Frames, f: int, s: int) -> Any:
 
 
 @inlined
-def _calibrated(test: LightTest, frames: Frames, f: int, y: Any, x: Any) -> Any:
+def _calibrated(test: LightTest, frames: Frames, f: int, y: int, x: int) -> Vector:
     """Return the calibrated pixels of a row of a frame from x on; NaN or infinite if bad."""
     height, line = frames.counts.shape[1:]
     at = y * line + x
@@ -255,7 +270,7 @@ def _calibrated(test: LightTest, frames: Frames, f: int, y: Any, x: Any) -> Any:
 
 
 @compiled
-def peak_above_border(test: LightTest, frames: Frames, f: int, s: int, scratch: Any) -> Any:
+def peak_above_border(test: LightTest, frames: Frames, f: int, s: int, scratch: Array) -> np.float32:
     """Return the largest sum of a window's pixels in a box, above the median of its four sides' means.
 
     Bad pixels count as the background; infinite without a good pixel on every side. `scratch` is used behind
@@ -299,7 +314,7 @@ def peak_above_border(test: LightTest, frames: Frames, f: int, s: int, scratch: 
 
 
 @compiled
-def _border_level(ny: int, nx: int, image: Any, at: Any) -> Any:
+def _border_level(ny: int, nx: int, image: Array, at: int) -> np.float32:
     """Return the median of the means of the four sides of an image; NaN if one has no good pixel."""
     top, bottom = _side_mean(image, at, 1, nx), _side_mean(image, at + (ny - 1) * nx, 1, nx)
     left, right = _side_mean(image, at, nx, ny), _side_mean(image, at + nx - 1, nx, ny)
@@ -309,7 +324,7 @@ def _border_level(ny: int, nx: int, image: Any, at: Any) -> Any:
 
 
 @inlined
-def _side_mean(image: Any, at: Any, step: Any, length: Any) -> Any:
+def _side_mean(image: Array, at: int, step: int, length: int) -> np.float32:
     """Return the mean of the good pixels of one side of an image; NaN without any."""
     total, count = np.float32(0.0), np.float32(0.0)
     for i in range(length):

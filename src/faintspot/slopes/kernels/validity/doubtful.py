@@ -1,16 +1,20 @@
 """Flags of spots that are probably wrong: cut by the window edge, or unlike all their neighbours."""
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
+from faintspot.base.arrays import Array
 from faintspot.base.flags import INVALID, UNMEASURED, SubapertureFlag
 from faintspot.slopes.kernels.compiling import compiled
+from faintspot.slopes.kernels.gather import Frames
 from faintspot.slopes.kernels.groups import SlopeArrays
 from faintspot.slopes.kernels.host import WIDTHS
 from faintspot.slopes.kernels.simd import (
     Lanes,
+    Pair,
+    Vector,
     any_lane,
     gathered,
     load,
@@ -44,19 +48,19 @@ _SURELY = 4.0
 class Expected(NamedTuple):
     """Expected positions of the spots."""
 
-    lanes: Any
+    lanes: Lanes
     """Lanes: W sub-apertures at once."""
-    zero: Any
+    zero: Array
     """(2, n) float32: reference positions x and y, px from the windows' middles."""
-    edge: Any
+    edge: Array
     """(2, n) float32: how far from its window's middle a spot is whole, px; infinite where not checked."""
-    lines: Any
+    lines: Array
     """(m, 2, p) int32: two sub-apertures in line with each, n where there is none; see `lines_of`."""
-    far: Any
+    far: Array
     """(m, p) float32: weight of the second one; NaN where there is none."""
-    behind: Any
+    behind: Array
     """(n, m, 2) int64: a neighbour of each and the one behind it, n where there is none; m may be 0."""
-    least: Any
+    least: np.float32
     """Smaller differences from a line never count, px."""
 
 
@@ -66,14 +70,16 @@ def doubtful_scratch_size(n: int) -> int:
 
 
 @compiled
-def check_slopes(test: LightTest, frames: Any, slopes: SlopeArrays, expected: Expected, scratch: Any) -> None:
+def check_slopes(
+    test: LightTest, frames: Frames, slopes: SlopeArrays, expected: Expected, scratch: Array
+) -> None:
     """Flag dark sub-apertures and doubtful spots of frames; see `flag_dark` and `flag_doubtful`."""
     flag_dark(test, frames, slopes, scratch)
     flag_doubtful(slopes.x, slopes.y, slopes.flux, slopes.flags, expected, scratch)
 
 
 @compiled
-def flag_doubtful(x: Any, y: Any, flux: Any, flags: Any, expected: Expected, scratch: Any) -> None:
+def flag_doubtful(x: Array, y: Array, flux: Array, flags: Array, expected: Expected, scratch: Array) -> None:
     """Add AT_SEARCH_LIMIT and UNLIKE_NEIGHBOURS to the flags of measured slopes, each (n_frames, n).
 
     Displacements that change evenly from one neighbour to the next are alike. `scratch` has at least
@@ -97,7 +103,7 @@ def flag_doubtful(x: Any, y: Any, flux: Any, flags: Any, expected: Expected, scr
 
 
 @compiled
-def _away(lanes: Lanes, first: int, at: Any, expected: Expected, enough: Any) -> Any:
+def _away(lanes: Lanes, first: int, at: tuple[Array, Array], expected: Expected, enough: Vector) -> Pair:
     """Return the squared differences of W slopes from the most similar of their lines; infinite without one.
 
     The first ones are divided by their variance for slopes of error 1, the second ones are in px^2. Lines are
@@ -126,7 +132,7 @@ def _away(lanes: Lanes, first: int, at: Any, expected: Expected, enough: Any) ->
 
 
 @compiled
-def _is_any_suspect(at: Any, expected: Expected) -> Any:
+def _is_any_suspect(at: tuple[Array, Array], expected: Expected) -> bool:
     """Return whether a slope may differ from each of its lines by more than the difference that counts."""
     lanes, width = expected.lanes, width_of(expected.lanes)
     like = splat(lanes, np.float32(0.99) * expected.least * expected.least)
@@ -140,7 +146,14 @@ def _is_any_suspect(at: Any, expected: Expected) -> Any:
 
 @compiled
 def _compare(
-    f: int, x: Any, y: Any, flux: Any, flags: Any, expected: Expected, at: Any, scratch: Any
+    f: int,
+    x: Array,
+    y: Array,
+    flux: Array,
+    flags: Array,
+    expected: Expected,
+    at: tuple[Array, Array],
+    scratch: Array,
 ) -> None:
     """Compare the slopes of a frame with their lines, and flag those unlike all their neighbours."""
     lanes, width = expected.lanes, width_of(expected.lanes)
@@ -165,7 +178,14 @@ def _compare(
 
 @compiled
 def _flag_unlike(
-    f: int, x: Any, y: Any, flux: Any, flags: Any, expected: Expected, differences: Any, least_px: Any
+    f: int,
+    x: Array,
+    y: Array,
+    flux: Array,
+    flags: Array,
+    expected: Expected,
+    differences: Array,
+    least_px: Array,
 ) -> None:
     """Add UNLIKE_NEIGHBOURS to the flags of a frame; take it from spots whose neighbours were wrong."""
     n = x.shape[1]
@@ -186,7 +206,7 @@ def _flag_unlike(
 
 
 @compiled
-def _has_other_flux(f: int, s: int, flux: Any, flags: Any, expected: Expected) -> Any:
+def _has_other_flux(f: int, s: int, flux: Array, flags: Array, expected: Expected) -> bool:
     """Return whether a window has clearly more flux than all its neighbours, or a fraction of it.
 
     A second spot or a ghost causes that. Windows with saturated pixels never count.
@@ -213,7 +233,7 @@ def _has_other_flux(f: int, s: int, flux: Any, flags: Any, expected: Expected) -
 
 
 @compiled
-def _is_continued(f: int, s: int, x: Any, y: Any, flags: Any, expected: Expected, limit: Any) -> Any:
+def _is_continued(f: int, s: int, x: Array, y: Array, flags: Array, expected: Expected, limit: float) -> bool:
     """Return whether a slope continues at least half of the lines of two valid ones beside it."""
     agree = total = 0
     for k in range(expected.behind.shape[1]):
@@ -228,7 +248,7 @@ def _is_continued(f: int, s: int, x: Any, y: Any, flags: Any, expected: Expected
 
 
 @compiled
-def _exceeds(values: Any, n: Any, limit: Any) -> Any:
+def _exceeds(values: Array, n: int, limit: float) -> bool:
     """Return whether a limit is at least the median of the first n values, without the negative ones."""
     above = below = 0
     for s in range(n):
@@ -238,7 +258,7 @@ def _exceeds(values: Any, n: Any, limit: Any) -> Any:
 
 
 @compiled
-def _median(values: Any, n: Any) -> Any:
+def _median(values: Array, n: int) -> np.float32:
     """Return the median of the first n values without the negative ones, to 2^-16 of the largest."""
     least, most = np.float32(0.0), np.float32(0.0)
     for s in range(n):
