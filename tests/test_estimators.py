@@ -18,7 +18,7 @@ import faintspot as fs
 from faintspot.slopes.estimators import estimators
 from faintspot.slopes.kernels.groups import Scratch
 from faintspot.slopes.kernels.parallel import run_groups
-from faintspot.slopes.pipeline.following import measure_images
+from faintspot.slopes.pipeline.images import measure_images
 from faintspot.slopes.spots.bounds import cramer_rao
 from faintspot.slopes.spots.psf import PSF
 

@@ -26,7 +26,7 @@ from tests.slopes.estimators.image_cases import KINDS, MAGNITUDES
 import faintspot as fs
 from faintspot.slopes.estimators import estimators
 from faintspot.slopes.kernels import groups
-from faintspot.slopes.pipeline.following import measure_images
+from faintspot.slopes.pipeline.images import measure_images
 from faintspot.slopes.spots.psf import PSF
 
 Flag = fs.SubapertureFlag

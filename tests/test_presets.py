@@ -13,7 +13,7 @@ from faintspot import Settings
 from faintspot.base.statistics import slope_error
 from faintspot.experiments import Cell
 from faintspot.experiments.study.cell import realisations
-from faintspot.slopes.pipeline.following import measure_images
+from faintspot.slopes.pipeline.images import measure_images
 
 CONVERGED: dict[str, Any] = {"tolerance": 1e-4, "max_iterations": 500}
 ENOUGH, TOLERANCE = 0.01, 0.03

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 import faintspot as fs
 from faintspot.slopes.estimators.built_in.window import Window
-from faintspot.slopes.pipeline.following import measure_images
+from faintspot.slopes.pipeline.images import measure_images
 
 SIDE, READ_NOISE_E, FWHM_PX, BLOCKS = 16, 3.0, 1.772, 40
 SPOTS = {"near the diffraction limit": 1.14, "speckled": 2.92}

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from benchmarks.loops.prediction import TELEMETRY_GAIN, Case
 from benchmarks.measuring import Candidate, Row, Table, best, interleaved, pinned
 from faintspot.loop.control.base import CommandDelayLine, Controller
-from faintspot.loop.control.identification.learning import learn_controller, relearn
+from faintspot.loop.control.identification.learning import learn_controller
 from faintspot.loop.control.identification.modal_model import LoopOfControl
 from faintspot.loop.control.identification.model import Kalman
 from faintspot.loop.control.identification.predictive_control import PredictiveControl
@@ -32,6 +32,7 @@ from faintspot.loop.control.kalman.local_predictor import local_shapes
 from faintspot.loop.control.kalman.modal_predictor import LargeGuarded
 from faintspot.loop.control.kalman.predictor import SlopeModel, SlopePredictor
 from faintspot.loop.control.reconstructor import Reconstructor
+from faintspot.loop.control.relearning import relearn
 from faintspot.loop.simulation import load_loop
 from faintspot.loop.simulation.record import slope_turbulence
 from faintspot.loop.simulation.telescope import prepare

@@ -14,9 +14,9 @@ from benchmarks.measuring import Row, Table
 from faintspot.base.statistics import paired_mean
 from faintspot.engine.control.guard import ControllerSuccessor, PreparedController
 from faintspot.loop.control.base import ASSUMED, WINDS, CommandDelayLine, Controller
-from faintspot.loop.control.identification.learning import RelearntControl, relearn
 from faintspot.loop.control.identification.model import Kalman
 from faintspot.loop.control.kalman.guard import HANDOVER_FRAMES
+from faintspot.loop.control.relearning import RelearntControl, relearn
 
 CASES = {
     "diffraction_limit, 20 photons": Case(20.0, 0.0),

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from faintspot.slopes.estimators.noise import Denoised as Denoised
     from faintspot.slopes.estimators.noise import tv_denoise as tv_denoise
     from faintspot.slopes.pipeline.following import SpotFollower as SpotFollower
-    from faintspot.slopes.pipeline.following import measure_images as measure_images
+    from faintspot.slopes.pipeline.images import measure_images as measure_images
     from faintspot.slopes.pipeline.light import MeanFlux as MeanFlux
     from faintspot.slopes.pipeline.settings import Settings as Settings
     from faintspot.slopes.pipeline.slope_pipeline import SlopePipeline as SlopePipeline

@@ -18,10 +18,11 @@ from faintspot.engine.request_handlers import commands_of
 from faintspot.engine.telemetry.ring import TelemetryRing
 from faintspot.loop.control.base import ASSUMED, SETTLE_FRAMES, OpenLoopTelemetry
 from faintspot.loop.control.configuration import Control, save_control
-from faintspot.loop.control.identification.learning import RelearntControl, learn_controller
+from faintspot.loop.control.identification.learning import learn_controller
 from faintspot.loop.control.identification.model import Kalman
 from faintspot.loop.control.integrator import LoopPlant
 from faintspot.loop.control.options import ControlOptions
+from faintspot.loop.control.relearning import RelearntControl
 from faintspot.slopes.pipeline import configuration as configuration_file
 from faintspot.slopes.pipeline.slopes import RESULT_TYPES, Slopes
 from faintspot.slopes.sensor.layout import Layout

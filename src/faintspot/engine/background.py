@@ -22,8 +22,8 @@ from faintspot.engine.telemetry.ring import TelemetryRing
 from faintspot.io.telemetry import CLOSED_LOOP, Telemetry, stored_names
 from faintspot.loop.control.base import KALMAN
 from faintspot.loop.control.configuration import Control, load_control, prior_std_px
-from faintspot.loop.control.identification.learning import FEWEST_FRAMES, RelearntControl, relearn
 from faintspot.loop.control.identification.open_loop import known_delay, open_loop_of
+from faintspot.loop.control.relearning import FEWEST_FRAMES, RelearntControl, relearn
 from faintspot.loop.telemetry.recording import recorded_loop, site_of
 from faintspot.slopes.pipeline.configuration import Configuration
 from faintspot.slopes.pipeline.settings import Settings

@@ -16,7 +16,8 @@ from faintspot.base.statistics import slope_statistics
 from faintspot.loop.simulation.methods import Method
 from faintspot.slopes.estimators.base import Estimator, Need, Style
 from faintspot.slopes.estimators.built_in.gravity import BrightestPixels, KeepingBrightest, Thresholded
-from faintspot.slopes.estimators.built_in.total_variation import Smoothed, TotalVariation
+from faintspot.slopes.estimators.built_in.smoothed import Smoothed
+from faintspot.slopes.estimators.built_in.total_variation import TotalVariation
 from faintspot.slopes.estimators.registry import estimators
 from faintspot.slopes.estimators.sensor import Scene
 from faintspot.slopes.pipeline.settings import Settings

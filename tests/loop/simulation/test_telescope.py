@@ -9,7 +9,8 @@ from faintspot.loop.simulation.telescope import (
 from faintspot.slopes.estimators.base import Estimator
 from faintspot.slopes.estimators.built_in.gravity import BrightestPixels, Thresholded
 from faintspot.slopes.estimators.built_in.maximum_likelihood import MaximumAPosteriori, MaximumLikelihood
-from faintspot.slopes.estimators.built_in.total_variation import Smoothed, TotalVariation
+from faintspot.slopes.estimators.built_in.smoothed import Smoothed
+from faintspot.slopes.estimators.built_in.total_variation import TotalVariation
 
 
 @pytest.mark.parametrize(

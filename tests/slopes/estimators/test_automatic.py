@@ -21,7 +21,8 @@ from faintspot.slopes.estimators.automatic import (
     automatic_strength,
 )
 from faintspot.slopes.estimators.built_in.gravity import BrightestPixels
-from faintspot.slopes.estimators.built_in.total_variation import Smoothed, TotalVariation
+from faintspot.slopes.estimators.built_in.smoothed import Smoothed
+from faintspot.slopes.estimators.built_in.total_variation import TotalVariation
 
 FWHM_OF_SIZE = {"diffraction": 1.772, "gaussian": 2.0}
 REALISATIONS = 600

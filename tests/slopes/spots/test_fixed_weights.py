@@ -10,7 +10,7 @@ from tests.refusals import assert_each_refused, refused
 
 import faintspot as fs
 from faintspot.slopes.estimators.built_in.window import Window
-from faintspot.slopes.pipeline.following import measure_images
+from faintspot.slopes.pipeline.images import measure_images
 from faintspot.slopes.spots.shapes import spots
 
 SIDE = 12

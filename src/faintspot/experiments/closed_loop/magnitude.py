@@ -42,7 +42,8 @@ from faintspot.loop.simulation.simulation import simulate_loop
 from faintspot.loop.simulation.telescope import camera_calibration
 from faintspot.slopes.estimators.base import Need
 from faintspot.slopes.estimators.built_in.gravity import BrightestPixels
-from faintspot.slopes.estimators.built_in.total_variation import Smoothed, TotalVariation
+from faintspot.slopes.estimators.built_in.smoothed import Smoothed
+from faintspot.slopes.estimators.built_in.total_variation import TotalVariation
 from faintspot.slopes.estimators.built_in.window import Window
 from faintspot.slopes.pipeline import configuration as configuration_file
 from faintspot.slopes.spots.psf import PSF

@@ -20,7 +20,7 @@ from faintspot.slopes.estimators.base import Estimator, Need
 from faintspot.slopes.estimators.built_in.gravity import KeepingBrightest
 from faintspot.slopes.estimators.registry import estimator_named
 from faintspot.slopes.estimators.sensor import Scene
-from faintspot.slopes.pipeline.following import measure_images
+from faintspot.slopes.pipeline.images import measure_images
 from faintspot.slopes.pipeline.settings import Settings
 from faintspot.slopes.pipeline.slopes import Slopes
 from faintspot.slopes.spots.psf import PSF, spot_psf

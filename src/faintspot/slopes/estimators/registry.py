@@ -80,7 +80,7 @@ _PACKAGE = "faintspot.slopes.estimators.built_in"
 _MODULES = {
     "brightest": "gravity",
     "tv": "total_variation",
-    "smoothed": "total_variation",
+    "smoothed": "smoothed",
     "centroid": "gravity",
     "thresholded": "gravity",
     "window": "window",

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from faintspot.io.frames import FrameSource
 from faintspot.slopes.camera.calibration import Calibration
-from faintspot.slopes.pipeline.following import measure_images
+from faintspot.slopes.pipeline.images import measure_images
 from faintspot.slopes.pipeline.settings import Settings
 from faintspot.slopes.sensor.layout import Layout
 from faintspot.slopes.spots.laser_spots import LaserSpots

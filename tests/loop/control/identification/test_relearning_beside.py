@@ -10,12 +10,7 @@ from tests.loop.control.frozen_flow import frozen_slopes
 from tests.loop.telemetry.loop_cases import AIR, NOISE_PX, RATE_HZ, recorded
 
 from faintspot.loop.control.base import OpenLoopTelemetry
-from faintspot.loop.control.identification.learning import (
-    FRAMES,
-    BesideTheLoop,
-    RecentFrames,
-    replayed_slopes,
-)
+from faintspot.loop.control.beside_the_loop import FRAMES, BesideTheLoop, RecentFrames, replayed_slopes
 from faintspot.loop.control.identification.predictive_control import PredictiveControl, learn
 
 

@@ -9,7 +9,7 @@ References: Chambolle 2004 (J. Math. Imaging Vis. 20, 89), Beck & Teboulle 2009 
 """
 
 import math
-from typing import TYPE_CHECKING
+from typing import Any
 
 from faintspot.base.arrays import Array
 from faintspot.slopes.kernels.compiling import compiled
@@ -34,9 +34,6 @@ from faintspot.slopes.kernels.total_variation.sweeps import (
     sweep_fgp,
     twice_divergence,
 )
-
-if TYPE_CHECKING:
-    from faintspot.slopes.kernels.positions.gravity import GravityScratch
 
 # Iterations between two convergence tests, which compare the images of both. Where a wide, shallow residue is
 # left, a single iteration changes little. A group goes on until its slowest lane has finished.
@@ -264,7 +261,7 @@ def denoise_group(
     window: tuple[int, int],
     image: Array,
     output: Array,
-    own: "GravityScratch",
+    own: Any,
 ) -> None:
     """Denoise the W images of a group.
 
