@@ -8,7 +8,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tests.cli.cli_cases import LAYOUT, Commands, assert_equal, command_line, simulated
+from tests.cli.cli_cases import LAYOUT, Commands, assert_equal, simulated
+from tests.engine.commands import start
 
 from faintspot import Settings, SlopePipeline, Slopes
 
@@ -16,9 +17,17 @@ pytest.importorskip("zarr")
 
 pytestmark = pytest.mark.slow
 
-N_FRAMES = 10_000  # three chunks of a store, the last one short
+N_FRAMES = 2000  # five chunks of a store, the last one short; a mark after each
 ITERATIONS = 500  # so that a run takes some seconds, and no signal comes after its end
 SETTINGS = Settings(noise_std=2.0, keep_brightest=10, tolerance=0.0, max_iterations=ITERATIONS)
+SMALL_CHUNKS = """
+import sys
+from faintspot.cli import main
+from faintspot.io import slopes_writer
+from faintspot.io.formats import zarr_files
+zarr_files._CHUNK_NUMBERS, slopes_writer._MARK_SECONDS = 450 * 16, 0.0
+main(sys.argv[1:])
+"""
 
 
 @pytest.fixture(scope="module")
@@ -44,9 +53,8 @@ def finished(output: Path) -> int:
 
 def start_and_stop(output: Path, number: int) -> tuple[int, str]:
     """Start the command, send it a signal when some of its frames are stored; exit code and errors."""
-    process = command_line(
-        "slopes", "a.npy", "-o", output.name, "--block", 50, "--threads", 1, cwd=output.parent
-    )
+    options = ("slopes", "a.npy", "-o", output.name, "--block", "50", "--threads", "1")
+    process = start(SMALL_CHUNKS, *options, cwd=output.parent)
     try:
         end = time.monotonic() + 300  # with compiling
         while not finished(output) and process.poll() is None and time.monotonic() < end:

@@ -77,7 +77,7 @@ def recorded(n: int, cells: Any, modes: int) -> Recording:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("n", "cells", "modes"), [(1, False, 2), (2, False, 5), (2, True, 5)])
+@pytest.mark.parametrize(("n", "cells", "modes"), [(1, False, 2), (2, True, 5)])
 def test_control_is_learnt(n: int, cells: bool, modes: int) -> None:
     control = learn(recorded(n, cells, modes))
     assert control(np.zeros(2 * n * n)).shape == (modes,)

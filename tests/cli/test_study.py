@@ -33,11 +33,11 @@ pytestmark = pytest.mark.slow
 
 SLOW = """
 name = "slow"
-realisations = 1500
+realisations = 1000
 estimators = ["brightest", "tv"]
 
 [sweeps.flux]
-flux_e = { from = 10, to = 1000, points = 12, spacing = "log" }
+flux_e = { from = 10, to = 1000, points = 6, spacing = "log" }
 """
 
 
@@ -85,7 +85,7 @@ def test_killed_and_started_again(folder: Path, run: Commands) -> None:
     except subprocess.TimeoutExpired:
         process.kill()
         raise
-    assert 2 <= int(open_study(store)["done"].sum()) < 12
+    assert 2 <= int(open_study(store)["done"].sum()) < 6
     run.ok("study", "slow.toml", "--workers", 0)
     whole = folder / "whole.zarr"
     run_study(StudySpecification.from_text(SLOW), whole, pool=WorkerPool(0))

@@ -49,29 +49,18 @@ def test_laser_guide_star_of_the_configuration(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_without_a_layout_it_says_what_to_do(run: Commands) -> None:
+def test_layout_and_calibration_are_asked_for_used_and_kept(run: Commands) -> None:
     assert "faintspot layout FRAME --pixels 8" in run.ok("tune", *KNOWN).out
-    LAYOUT.save("faintspot.toml")
-    assert len(SlopePipeline.from_file("faintspot.toml").layout) == 16
-    run.refused("tune", *KNOWN, naming=("faintspot.toml", "--overwrite"))
-    run.ok("tune", *KNOWN, "--overwrite")
-    assert len(SlopePipeline.from_file("faintspot.toml").layout) == 16
+    calibration = Calibration(dark=100.0, gain_e_per_adu=2.0, read_noise_e=4.0)
+    for item in (LAYOUT, calibration):
+        item.save("faintspot.toml")
+    assert "read noise 4 e-" in run.ok("tune", "--fwhm-px", "1.8", "--flux-e", 200, "--overwrite").out
+    pipeline = SlopePipeline.from_file("faintspot.toml")
+    assert (len(pipeline.layout), pipeline.calibration) == (16, calibration)
 
 
 @pytest.mark.slow
-def test_calibration_of_an_existing_configuration_counts_and_stays(run: Commands) -> None:
-    LAYOUT.save("faintspot.toml")
-    Calibration(dark=100.0, gain_e_per_adu=2.0, read_noise_e=4.0).save("faintspot.toml")
-    result = run.ok("tune", "--fwhm-px", "1.8", "--flux-e", 200, "--overwrite")
-    assert "read noise 4 e-" in result.out
-    assert SlopePipeline.from_file("faintspot.toml").calibration == Calibration(
-        dark=100.0, gain_e_per_adu=2.0, read_noise_e=4.0
-    )
-
-
-@pytest.mark.slow
-def test_tuning_in_binned_pixels(run: Commands, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
+def test_tuning_in_binned_pixels(run: Commands) -> None:
     layout = Layout.grid((4, 4), pixels=16, bin=2, frame_shape=(65, 65))
     layout.save("layout.toml")
     Calibration(dark=100.0, read_noise_e=1.5).save("layout.toml")

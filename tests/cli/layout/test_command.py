@@ -1,6 +1,7 @@
 """faintspot layout: from a frame to a configuration that faintspot slopes accepts, and a picture."""
 
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -73,7 +74,7 @@ def test_simulated_frames_give_their_lattice(folder: Path, run: Commands, geomet
 @pytest.mark.usefixtures("only_found")
 def test_slopes_do_not_depend_on_the_unit_of_the_frames(folder: Path, run: Commands) -> None:
     found, settings = [], []
-    for name, scale in (("small", 1e-4), ("as_they_are", 1.0), ("large", 1e4)):
+    for name, scale in (("small", 1e-4), ("large", 1e4)):
         np.save(f"{name}.npy", (scale * frames()).astype(np.float32))
         run.ok("layout", f"{name}.npy", "-o", f"{name}.toml", "--pixels", 16)
         run.ok("slopes", f"{name}.npy", "-c", f"{name}.toml", "-o", f"{name}.npz")
@@ -82,8 +83,7 @@ def test_slopes_do_not_depend_on_the_unit_of_the_frames(folder: Path, run: Comma
         found.append(np.stack([stored["x"], stored["y"]]))
         settings.append(Settings.load(f"{name}.toml"))
     np.testing.assert_allclose(found[0], found[1], atol=1e-4)
-    np.testing.assert_allclose(found[2], found[1], atol=1e-4)
-    assert settings[0] == settings[1] == settings[2]
+    assert settings[0] == settings[1]
 
 
 @pytest.mark.usefixtures("no_trials", "coarse_pictures")
@@ -112,7 +112,9 @@ def test_exists_already_and_overwrite_keeps_calibration_and_scales(folder: Path,
     layout = Layout.load("new.toml")
     assert layout.window == (10, 10)
     assert (layout.pixel_scale_arcsec, layout.subaperture_m, layout.diameter_m) == (0.5, 0.6, 4.2)
-    kept = replace(Calibration.load("new.toml"), read_noise_e=None, estimated=())
+    calibration = Calibration.load("new.toml")
+    assert calibration.dark_is_known
+    kept = replace(calibration, read_noise_e=None, estimated=())
     assert kept == Calibration(dark=90.0, gain_e_per_adu=2.0)
 
 
@@ -152,18 +154,16 @@ def test_maps_of_the_camera(folder: Path, run: Commands) -> None:
     np.save("flat.npy", np.stack([20000 * flat, 20000 * flat]))
     np.save("map.npy", bad)
     np.save("list.npy", np.argwhere(bad))
-    options = ("--dark", "dark.npy", "--flat", "flat.npy", "--read-noise-e", "3", "--pixels", 16)
-    run.ok("layout", "a.npy", "-o", "new.toml", *options, "--bad-pixels", "map.npy")
-    calibration = Calibration.load("new.toml")
-    np.testing.assert_allclose(calibration.dark, dark)
-    np.testing.assert_allclose(calibration.flat, flat / flat.mean())
-    assert calibration.read_noise_e == 3.0
     np.save("noise.npy", flat)
-    run.ok("layout", "a.npy", "-o", "noise.toml", "--read-noise-e", "noise.npy", "--pixels", 16)
-    np.testing.assert_allclose(np.asarray(Calibration.load("noise.toml").read_noise_e), flat)
-    assert len(Layout.load("new.toml")) == 49
-    run.ok("layout", "a.npy", "-o", "other.toml", *options, "--bad-pixels", "list.npy")
-    assert np.asarray(Calibration.load("other.toml").bad_pixels).tolist() == [[3, 5], [40, 41]]
+    for name, noise in (("map.npy", "3"), ("list.npy", "noise.npy")):
+        options = ("--dark", "dark.npy", "--flat", "flat.npy", "--read-noise-e", noise, "--bad-pixels", name)
+        run.ok("layout", "a.npy", "-o", "new.toml", "--overwrite", "--pixels", 16, *options)
+        calibration = Calibration.load("new.toml")
+        np.testing.assert_allclose(calibration.dark, dark)
+        np.testing.assert_allclose(calibration.flat, flat / flat.mean())
+        np.testing.assert_allclose(np.asarray(calibration.read_noise_e), 3.0 if noise == "3" else flat)
+        np.testing.assert_array_equal(calibration.bad_pixels, np.load(name))
+        assert len(Layout.load("new.toml")) == 49
 
 
 @pytest.mark.slow
@@ -266,8 +266,6 @@ def test_dark_level_and_hot_pixels_of_the_frame(run: Commands, folder: Path) -> 
     # The median of some hundred background pixels with 3 ADU of noise and faint wings of the spots.
     assert calibration.dark == pytest.approx(OFFSET_ADU, abs=1.5)
     assert not calibration.dark_is_known
-    run.ok("layout", "frames.npy", "-o", "new.toml", "--dark", "70", "--overwrite")
-    assert Calibration.load(folder / "new.toml").dark_is_known
 
 
 @pytest.mark.usefixtures("only_found")
@@ -320,19 +318,19 @@ def test_a_stated_pitch_keeps_the_defocus_of_the_frame(folder: Path, run: Comman
 def test_what_was_estimated_is_estimated_again_and_what_is_stated_stays(folder: Path, run: Commands) -> None:
     """Dark level and noise, so that slopes have standard errors; the noise stated first, then estimated."""
     arguments = ("layout", "a.npy", "--overwrite", "-o", "new.toml")
-    np.save("a.npy", defocused(1.0))
+    np.save("a.npy", frames() + 20)
     run.ok(*arguments)
     first = Calibration.load("new.toml")
-    assert first.dark == pytest.approx(120, abs=1)
-    assert first.read_noise_e == pytest.approx(np.sqrt(20 + 3**2), rel=0.1)
+    assert first.dark == pytest.approx(120, abs=1.5)
+    assert first.read_noise_e == pytest.approx(3, rel=0.1)
     assert {"dark", "read_noise_e"} <= set(first.estimated)
     run.ok("slopes", "a.npy", "-c", "new.toml", "-o", "s.npz")
     assert np.isfinite(read_slopes("s.npz").variables["standard_error_x"]).all()
     run.ok(*arguments, "--read-noise-e", "3")
-    np.save("a.npy", defocused(1.0) - 20)
+    np.save("a.npy", frames())
     result = run.ok(*arguments)
     again = Calibration.load("new.toml")
-    assert again.dark == pytest.approx(100, abs=1)
+    assert again.dark == pytest.approx(100, abs=1.5)
     assert again.read_noise_e == 3.0
     assert "kept" in result.out
     assert "read_noise_e 3" in result.out
@@ -341,8 +339,8 @@ def test_what_was_estimated_is_estimated_again_and_what_is_stated_stays(folder: 
 @pytest.mark.slow
 @pytest.mark.usefixtures("only_found")
 def test_doubts_are_repeated_until_they_are_accepted(folder: Path, run: Commands) -> None:
-    np.save("a.npy", defocused(1.0))
-    run.ok("layout", "a.npy", "-o", "new.toml")
+    np.save("a.npy", frames(n_frames=1))
+    run.ok("layout", "a.npy", "-o", "new.toml", "--pixels", 16)
     layout = Layout.load("new.toml")
     replace(layout, doubts=("8 lenslets may be dark",)).save("new.toml")
     with pytest.warns(DoubtWarning, match="8 lenslets may be dark"):
@@ -357,21 +355,19 @@ def test_doubts_are_repeated_until_they_are_accepted(folder: Path, run: Commands
 
 @pytest.mark.usefixtures("only_found")
 @pytest.mark.slow
-@pytest.mark.parametrize("bad", [0, 3, 7])
-def test_one_bad_frame_does_not_decide_the_settings(folder: Path, run: Commands, bad: int) -> None:
-    """Overexposed, with stray light, or without flux; and frames that a grabber wrote twice."""
+def test_one_bad_frame_does_not_decide_the_settings(folder: Path, run: Commands) -> None:
+    """Overexposed, with stray light, or without flux, the first or the last; and frames written twice."""
     good = np.concatenate([frames(n_frames=7), frames(n_frames=1)]).astype(np.float64)
     expected = good[:7].round().astype(np.uint16)
     np.save("good.npy", expected)
     run.ok("layout", "good.npy", "-o", "good.toml", "--pixels", 16)
     row, column = np.mgrid[: SHAPE[0], : SHAPE[1]]
     stray = 500 * np.exp(-0.5 * ((row - 60) ** 2 + (column - 100) ** 2) / 40**2)
-    for index, wrong in enumerate(
-        (6 * (expected[0] - OFFSET_ADU) + OFFSET_ADU + stray, expected[0] * 0 + 100)
-    ):
-        cube = np.insert(expected, [min(bad, 6), 5], [wrong, expected[4]], axis=0)
-        np.save(f"{index}.npy", cube.astype(np.uint16))
-        out = run.ok("layout", f"{index}.npy", "-o", f"{index}.toml", "--pixels", 16).out
+    bright = 6 * (expected[0] - OFFSET_ADU) + OFFSET_ADU + stray
+    for bad, wrong in product((0, 6), (bright, expected[0] * 0 + 100)):
+        cube = np.insert(expected, [bad, 5], [wrong, expected[4]], axis=0)
+        np.save("bad.npy", cube.astype(np.uint16))
+        out = run.ok("layout", "bad.npy", "-o", "bad.toml", "--pixels", 16, "--overwrite").out
         assert out.count("left out") == 2
-        assert Settings.load(f"{index}.toml") == Settings.load("good.toml")
-        assert Calibration.load(f"{index}.toml") == Calibration.load("good.toml")
+        assert Settings.load("bad.toml") == Settings.load("good.toml")
+        assert Calibration.load("bad.toml") == Calibration.load("good.toml")

@@ -12,6 +12,7 @@ import pytest
 from rich.console import Console
 from tests.cli.cli_cases import Commands
 from tests.engine.commands import start
+from tests.experiments.experiment_cases import small
 from tests.shared_data import skip_without
 
 from faintspot.base.errors import InputError
@@ -54,11 +55,13 @@ def frames_measured(name: str) -> int:
 def test_from_an_empty_folder_to_a_table(tmp_path: Path, name: str) -> None:
     """Interrupted, it gives a table of what it has seen, and leaves nothing behind.
 
-    Its filter learns from 300 frames, and turns are short: how good methods are is not asked.
+    The telescope is small, its filter learns from 300 frames, and turns are short: how good methods are is
+    not asked.
     """
+    (tmp_path / "star.toml").write_text(small().to_text(), encoding="utf-8")
     code = (
         "from faintspot.engine.page import demonstration; from faintspot.cli import main; "
-        "demonstration._LEARN_FRAMES, demonstration._TURN_S = 300, 0.5; main()"
+        "vars(demonstration).update(_LEARN_FRAMES=300, _TURN_S=0.5, _STAR='star.toml'); main()"
     )
     arguments = f"realtime demo --frame-rate-hz 50 --seconds 240 --port 0 --name {name}".split()
     process = start(code, *arguments, cwd=tmp_path)
