@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from tests.beyond_linux import POSIX_MODULES
 from tests.cli.cli_cases import CONFIGURATION, STUDY, Commands, assert_equal, expected, simulated
+from tests.refusals import refused
 
 import faintspot as fs
-from faintspot import InputError
 from faintspot.base import errors
 from faintspot.cli.realtime import command as realtime
 
@@ -101,7 +101,7 @@ def test_real_time_needs_linux(monkeypatch: pytest.MonkeyPatch) -> None:
     for name, command in commands.items():
         assert command is not None
         assert command.callback is not None
-        with click.Context(command, info_name=name), pytest.raises(InputError, match=f"^{name} needs Linux$"):
+        with click.Context(command, info_name=name), refused(name, "Linux"):
             command.callback()
 
 

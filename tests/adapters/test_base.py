@@ -128,20 +128,17 @@ def test_mean_flux_is_followed_where_nobody_says_it() -> None:
     assert measured.flux.flux_e.max() < 60.0  # calibrations do not count
 
 
-@pytest.mark.parametrize(
-    ("settings", "options"),
-    [
+def test_mean_flux_that_is_known_or_not_wanted() -> None:
+    for settings, options in (
         (Settings("window", flux_e=FAINT_E), {}),
         (Settings("window"), {"flux_frames": None}),
-    ],
-)
-def test_mean_flux_that_is_known_or_not_wanted(settings: Settings, options: dict[str, Any]) -> None:
-    rng, measured = np.random.default_rng(2), tool(settings, **options)
-    before = measured.pipeline
-    for _ in range(30):
-        measured.measure(tall(noisy(rng)))
-    assert measured.flux is None
-    assert measured.pipeline is before
+    ):
+        rng, measured = np.random.default_rng(2), tool(settings, **options)
+        before = measured.pipeline
+        for _ in range(30):
+            measured.measure(tall(noisy(rng)))
+        assert measured.flux is None
+        assert measured.pipeline is before
 
 
 def test_a_prior_draws_slopes_towards_it() -> None:

@@ -183,24 +183,23 @@ def test_axes_that_run_backwards(optics: Any) -> None:
     )
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"detector_grid": "polar"}, "regular two-dimensional Cartesian"),
-        ({"mla_index": np.zeros(84 * 84)}, "detector_grid: expected an hcipy.Grid"),
-        ({"mla_grid": "far"}, "on the detector"),
-        ({"mla_grid": "dense"}, "px between centres"),
-        ({"estimation_subapertures": np.ones(7, bool)}, "expected a mask of 49"),
-        ({"pixels": 14}, "49 lenslets|leave it|overlap"),
-    ],
-)
-def test_refused_in_one_line(optics: Any, change: dict[str, Any], message: str) -> None:
-    grid, mla = optics.mla_index.grid, optics.mla_grid
-    grids = {"polar": grid.as_("polar"), "far": mla.shifted((1.0, 0.0)), "dense": mla.scaled(0.1)}
-    arguments = {"mla_grid": mla, "mla_index": optics.mla_index, "settings": FAINT}
-    arguments |= {name: grids[value] if isinstance(value, str) else value for name, value in change.items()}
-    with refused(match=message):
-        SlopeEstimator(**arguments)
+def test_refused_in_one_line(optics: Any) -> None:
+    for change, names in (
+        ({"detector_grid": "polar"}, ("Cartesian",)),
+        ({"mla_index": np.zeros(84 * 84)}, ("detector_grid",)),
+        ({"mla_grid": "far"}, ("detector",)),
+        ({"mla_grid": "dense"}, ("px",)),
+        ({"estimation_subapertures": np.ones(7, bool)}, ("49",)),
+        ({"pixels": 14}, ()),
+    ):
+        grid, mla = optics.mla_index.grid, optics.mla_grid
+        grids = {"polar": grid.as_("polar"), "far": mla.shifted((1.0, 0.0)), "dense": mla.scaled(0.1)}
+        arguments = {"mla_grid": mla, "mla_index": optics.mla_index, "settings": FAINT}
+        arguments |= {
+            name: grids[value] if isinstance(value, str) else value for name, value in change.items()
+        }
+        with refused(*names):
+            SlopeEstimator(**arguments)
 
 
 def test_calibration_and_prediction(optics: Any) -> None:

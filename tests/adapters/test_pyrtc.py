@@ -8,7 +8,6 @@ from tests.adapters.adapter_cases import ESTIMATORS, POSITIONS, SIDE, N, images,
 from tests.adapters.test_specula import GRID, TABLES, frame_of
 from tests.refusals import refused
 
-from faintspot import InputError
 from faintspot.adapters import pyrtc
 from faintspot.adapters.pyrtc import _Measuring
 
@@ -93,8 +92,7 @@ def test_refused_in_one_line() -> None:
         _ = measuring().tool
     with pytest.raises(AttributeError, match="no attribute 'Slopes'"):
         _ = pyrtc.Slopes
-    message = r"10 px on the frame of 30 x 30, got 3 that leave it, first row 2, column 0; leave them out"
-    with pytest.raises(InputError, match=message):
+    with refused("10 px", "30 x 30", "got 3", "row 2, column 0"):
         measuring().maps(process(offset_y=1), frame_of(images()), no_stream)
 
 

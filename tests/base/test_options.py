@@ -30,9 +30,8 @@ class Sample(Options):
 
 
 class TestOneValue:
-    @pytest.mark.parametrize(
-        ("name", "given", "kept"),
-        [
+    def test_values_are_kept_as_their_type(self) -> None:
+        for name, given, kept in (
             ("number", np.float32(0.5), 0.5),
             ("number", 0, 0.0),
             ("number", 10.0, 10.0),
@@ -45,16 +44,13 @@ class TestOneValue:
             ("found", 3.0, 3.0),
             ("one", 5, 5),
             ("kind", "y", "y"),
-        ],
-    )
-    def test_values_are_kept_as_their_type(self, name: str, given: Any, kept: Any) -> None:
-        value = getattr(Sample(**{name: given}), name)
-        assert value == kept
-        assert isinstance(value, type(kept))
+        ):
+            value = getattr(Sample(**{name: given}), name)
+            assert value == kept
+            assert isinstance(value, type(kept))
 
-    @pytest.mark.parametrize(
-        ("words", "changes"),
-        [
+    def test_wrong_values_are_refused(self) -> None:
+        for words, changes in (
             ("number = 11: expected a number from 0 to 10", {"number": 11}),
             ("above = 0: expected a number above 0", {"above": 0.0}),
             ("name = 'c': expected one of 'a', 'b'", {"name": "c"}),
@@ -73,11 +69,9 @@ class TestOneValue:
             ('found: expected "auto" for the whole sensor', {"found": PerSubaperture("auto", {0: 1.0})}),
             ("found", {"found": ["auto", 1.0]}),
             ("arrays of one length, got number 2, above 3", {"number": [1, 2], "above": [1, 2, 3]}),
-        ],
-    )
-    def test_wrong_values_are_refused(self, words: str, changes: dict[str, Any]) -> None:
-        with refused(words):
-            Sample(**changes)
+        ):
+            with refused(words):
+                Sample(**changes)
 
 
 class TestEachSubaperture:
@@ -133,20 +127,17 @@ class TestChanges:
         assert names.values("name", 2, 16).tolist() == ["b", "a"]
         assert Sample().replaced({"number": 3.0}) == Sample(number=3.0)
 
-    @pytest.mark.parametrize(
-        ("words", "changes", "where"),
-        [
+    def test_wrong_replacements_are_refused(self) -> None:
+        for words, changes, where in (
             ("numbr: expected one of number, above", {"numbr": 1.0}, None),
             ("one: expected one value for the whole sensor", {"one": 3}, [0]),
             ("as many as `where`, got 3", {"number": [1, 2, 3]}, [0, 1]),
             ("where", {"number": 1.0}, [-1]),
             ("where", {"number": 1.0}, [0.5]),
             ("where", {"number": 1.0}, "all"),
-        ],
-    )
-    def test_wrong_replacements_are_refused(self, words: str, changes: dict[str, Any], where: Any) -> None:
-        with refused(words):
-            Sample().replaced(changes, where)
+        ):
+            with refused(words):
+                Sample().replaced(changes, where)
 
     def test_what_was_chosen(self) -> None:
         assert Sample().chosen() == {}

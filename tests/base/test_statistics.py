@@ -33,20 +33,17 @@ def test_float32_positions_do_not_lose_digits_of_the_truth() -> None:
     )
 
 
-@pytest.mark.parametrize(
-    ("x", "y", "truth", "words"),
-    [
+def test_positions_of_wrong_shape_are_refused() -> None:
+    for x, y, truth, words in (
         (np.ones(3), np.ones(3), np.ones(3), "truth: expected shape (3, 2)"),
         (np.ones(3), np.ones(3), np.ones((2, 2)), "truth: expected shape (3, 2)"),
         (np.full(3, np.nan), np.ones(3), np.ones((3, 2)), "x: expected finite numbers"),
         ([], [], np.ones((0, 2)), "at least one value"),
         (np.ones(3), np.ones(3), np.full((3, 2), np.inf), "truth: expected finite numbers"),
-    ],
-)
-def test_positions_of_wrong_shape_are_refused(x: Any, y: Any, truth: Any, words: str) -> None:
-    for function in (slope_error, slope_statistics):
-        with refused(words):
-            function(x, y, truth)
+    ):
+        for function in (slope_error, slope_statistics):
+            with refused(words):
+                function(x, y, truth)
 
 
 def test_standard_error_of_r_covers_the_truth() -> None:

@@ -25,19 +25,16 @@ def test_a_file_gives_its_tables(tmp_path: Path) -> None:
         text_files.parse_file(path, if_missing="`make demo` makes one")
 
 
-@pytest.mark.parametrize(
-    ("table", "message"),
-    [
+def test_unknown_and_missing_keys_are_named() -> None:
+    for table, message in (
         ({"noise_std": 1, "nois_std": 1}, "settings.nois_std: unknown key; did you mean noise_std?"),
         ({"noise_std": 1, "zzz": 1}, "settings.zzz: unknown key; known: noise_std, rule"),
         ({"rule": 1}, "settings.noise_std: expected a value, found none"),
-    ],
-)
-def test_unknown_and_missing_keys_are_named(table: dict[str, int], message: str) -> None:
-    text_files.check_keys("settings.", {"noise_std": 1}, ("noise_std", "rule"), required=["noise_std"])
-    with pytest.raises(InputError) as error:
-        text_files.check_keys("settings.", table, ("noise_std", "rule"), required=["noise_std"])
-    assert str(error.value) == message
+    ):
+        text_files.check_keys("settings.", {"noise_std": 1}, ("noise_std", "rule"), required=["noise_std"])
+        with pytest.raises(InputError) as error:
+            text_files.check_keys("settings.", table, ("noise_std", "rule"), required=["noise_std"])
+        assert str(error.value) == message
 
 
 # The page's server looks for lone surrogates, which text may hold in memory and not in a message.

@@ -3,7 +3,6 @@
 import sys
 import tracemalloc
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -126,9 +125,8 @@ def test_damaged_chunk_of_a_store(
         read_slopes(store)
 
 
-@pytest.mark.parametrize(
-    ("name", "parts", "changes"),
-    [
+def test_descriptions_that_do_not_fit_are_refused(tmp_path: Path) -> None:
+    for name, parts, changes in (
         ("slopes.txt", (".zarr", ".fits.gz", ".npz", ".csv"), {}),
         ("a.npz", ("fingerprint",), {"attributes": {}}),
         ("a.npz", ("complete",), {"attributes": {"fingerprint": "a", "complete": True}}),
@@ -136,13 +134,9 @@ def test_damaged_chunk_of_a_store(
         ("a.npz", ("shape (7,)",), {"coordinates": {"centre_x": np.zeros(3)}}),
         ("a.npz", ("'x'",), {"coordinates": {"x": np.zeros(7)}}),
         ("a.npz", ("n_frames",), {"n_frames": 0}),
-    ],
-)
-def test_descriptions_that_do_not_fit_are_refused(
-    tmp_path: Path, name: str, parts: tuple[str, ...], changes: Any
-) -> None:
-    assert_refused(tmp_path / name, *parts, **changes)
-    assert not list(tmp_path.iterdir())
+    ):
+        assert_refused(tmp_path / name, *parts, **changes)
+        assert not list(tmp_path.iterdir())
 
 
 class TestWithoutZarr:

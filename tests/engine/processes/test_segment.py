@@ -8,7 +8,6 @@ import pytest
 from tests import refusals
 from tests.engine.commands import needs_shared_memory
 
-from faintspot.base.errors import InputError
 from faintspot.engine.frames.pixel_ring import PixelRing
 from faintspot.engine.processes.segment import FOLDER
 
@@ -89,6 +88,6 @@ def test_full_shared_memory_is_said(name: str, monkeypatch: pytest.MonkeyPatch) 
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(os, "posix_fallocate", full)
-    with pytest.raises(InputError, match=r"cannot be created, .* MiB \(No space left on device\)"):
+    with refusals.refused(name, "MiB", "No space left"):
         PixelRing.create(name, SHAPE, np.float32)
     assert not [path for path in FOLDER.iterdir() if name in path.name]

@@ -15,6 +15,7 @@ from typing import Any
 from uuid import uuid4
 
 import pytest
+from tests import refusals
 from tests.engine.commands import start
 
 from faintspot.base.errors import InputError
@@ -81,7 +82,7 @@ def test_a_folder_that_was_chosen_is_not_changed(
     folder = tmp_path / "locks"
     folder.mkdir(0o755)
     monkeypatch.setenv("PYSHMEM_LOCK_DIR", str(folder))
-    with pytest.raises(InputError, match=r"nobody else may enter \(mode 0700\)"):
+    with refusals.refused(f"{folder}", "0700"):
         create_stream(name, (4,))
     folder.chmod(0o700)
     create_stream(name, (4,)).unlink()
@@ -113,7 +114,7 @@ def test_publishing_does_not_wait_for_a_lock_for_ever(name: str, monkeypatch: py
     path = lock_file(f"{name}_details")
     with path.open("wb") as held:
         fcntl.flock(held, fcntl.LOCK_EX)
-        with pytest.raises(InputError, match=f"_details: another process holds {path}"), streams.held():
+        with refusals.refused("_details", f"{path}"), streams.held():
             pass
     with streams.held():
         pass
@@ -181,7 +182,7 @@ def test_pyshmem_needs_libatomic_on_other_processors(monkeypatch: pytest.MonkeyP
     monkeypatch.setattr(platform, "machine", lambda: "x86_64")
     assert pyshmem_module("publishing") is pyshmem
     monkeypatch.setattr(platform, "machine", lambda: "aarch64")
-    with pytest.raises(InputError, match="libatomic on aarch64, found none"):
+    with refusals.refused("libatomic", "aarch64"):
         pyshmem_module("publishing")
     monkeypatch.setattr(ctypes.util, "find_library", lambda _: "libatomic.so.1")
     assert pyshmem_module("publishing") is pyshmem
@@ -189,7 +190,7 @@ def test_pyshmem_needs_libatomic_on_other_processors(monkeypatch: pytest.MonkeyP
 
 def test_of_three_streams_all_or_none(name: str) -> None:
     with maker(f"{name}_marks"):
-        with pytest.raises(InputError, match="_marks: a living process"):
+        with refusals.refused("_marks"):
             SlopeStreams(name, 3)
         assert not segments(f"{name}_slopes")[0].exists()
     SlopeStreams(name, 3).close()

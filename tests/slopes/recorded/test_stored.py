@@ -11,7 +11,6 @@ from tests.patience import mostly_slow
 from tests.refusals import refused
 from tests.slopes.recorded.recorded_cases import SETTINGS, Page, sensor, simulated
 
-from faintspot.base.errors import InputError
 from faintspot.io import create_writer
 from faintspot.slopes.camera.calibration import Calibration
 from faintspot.slopes.pipeline import configuration
@@ -80,7 +79,7 @@ def test_two_stores_are_two_methods(tmp_path: Path) -> None:
 def test_two_stores_of_the_same_kind_are_named_by_their_files(tmp_path: Path) -> None:
     paths = [store(tmp_path / name, sensor()) for name in ("a.npz", "b.npz")]
     assert "Settings of 'b.npz'" in Page(report_of_stored(paths)).text
-    with pytest.raises(InputError, match="the same twice"):
+    with refused("a.npz"):
         report_of_stored([paths[0], paths[0]])
 
 
@@ -91,10 +90,10 @@ def test_stores_of_different_sensors_are_refused_in_one_line(tmp_path: Path) -> 
     moved = Layout(plain.frame_shape, plain.window, plain.corners, plain.centres + 0.5)
     other = store(tmp_path / "c.npz", moved)
     for second, words in ((smaller, "9 sub-apertures"), (other, "the layout of")):
-        with refused(match=words):
+        with refused(words):
             report_of_stored([first, second])
     for paths in ([], [first] * 3):
-        with pytest.raises(InputError, match="one file or two"):
+        with refused("one", "two", f"{len(paths)}"):
             report_of_stored(paths)
 
 
