@@ -5,7 +5,6 @@ import subprocess
 import sys
 
 import pytest
-from tests.fuzz import kernels
 from tests.fuzz.__main__ import PARTS
 from tests.shared_data import ROOT
 
@@ -37,8 +36,3 @@ def test_nothing_is_found(part: str) -> None:
     widest = str(lanes_for("float32").width)
     done = python("-m", "tests.fuzz", "--part", part, "--seed", "0", "--minutes", "0.05", "--widths", widest)
     assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
-
-
-def test_priors_beyond_the_frame_are_no_finding() -> None:
-    """The pipeline does not use them, and neither does what it is compared with."""
-    kernels.run(20261133, kernels.combinations())

@@ -90,15 +90,6 @@ class TestAgainstOracle:
         assert result.iterations.tolist() == [e.iterations for e in expected]
         assert result.converged.tolist() == [e.converged for e in expected]
 
-    @pytest.mark.slow
-    @pytest.mark.parametrize("width", ["4", "16"])
-    def test_any_simd_width(self, width: str, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setenv("FAINTSPOT_SIMD_WIDTH", width)
-        stack = np.random.default_rng(1).normal(size=(37, 9, 7)).astype(np.float32)
-        result = fs.tv_denoise(stack, 0.6, tolerance=0.0, max_iterations=24)
-        expected = np.array([naive.tv_denoise(g, 0.6, tolerance=0.0, max_iterations=24).image for g in stack])
-        assert np.max(np.abs(result - expected)) <= tolerance_of(np.float32) * largest(stack).max()
-
     @pytest.mark.parametrize("width", ["3", "32", "wide", ""])
     def test_refuses_other_simd_widths(self, width: str, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setenv("FAINTSPOT_SIMD_WIDTH", width)
