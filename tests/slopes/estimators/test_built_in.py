@@ -50,7 +50,7 @@ OPTIONS: dict[str, dict[str, Any]] = {
 }
 # The iterations of "tv" stop at a relative change of 1 %, where they have not yet made the image symmetric.
 CENTRE_TOLERANCE_PX = {"tv": 0.015}
-ONE_OF_EACH_FAMILY = ("brightest", "tv", "window", "weighted", "map", "power")
+ONE_OF_EACH_FAMILY = ("tv", "window", "map", "power")
 
 
 class TestEveryEstimator(EstimatorTests):
@@ -110,7 +110,7 @@ def test_a_threshold_gives_the_same_at_every_width_bit_for_bit(side: int) -> Non
     calibration = fs.Calibration(100.3, gain_e_per_adu=0.51, read_noise_e=1.0)
     frames = 100 + np.random.default_rng(side).poisson(6.0, (10, *layout.frame_shape)).astype(np.float32)
     wide = fs.SlopePipeline(layout, fs.Settings("thresholded", threshold_e=0.7), calibration)
-    for width in (4, 8, 16):
+    for width in filter(wide.width.__ge__, (4, 8, 16)):
         narrow = wide.with_width(width)(frames)
         for field in (*FIELDS, "standard_error_x", "standard_error_y", "covariance_xy"):
             np.testing.assert_array_equal(getattr(narrow, field), getattr(wide(frames), field))

@@ -25,10 +25,9 @@ class TestAgainstOracle:
         assert_equals_oracle(case, case.pipeline()(case.frame))
 
     @pytest.mark.slow
-    @pytest.mark.parametrize("dtype", ["uint16", "float32"])
     @given(seed=st.integers(0, 2**32 - 1))
-    def test_random_sensors_with_the_other_algorithm(self, dtype: str, seed: int) -> None:
-        case = random_case(seed, dtype, "chambolle")
+    def test_random_sensors_with_the_other_algorithm(self, seed: int) -> None:
+        case = random_case(seed, "float32" if seed % 2 else "uint16", "chambolle")
         assert_equals_oracle(case, case.pipeline()(case.frame))
 
     @pytest.mark.slow
