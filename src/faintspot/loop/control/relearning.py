@@ -3,22 +3,23 @@
 import math
 from dataclasses import dataclass, replace
 
-import numpy as np
-
-from faintspot.base.arrays import Floats
 from faintspot.base.errors import InputError
 from faintspot.loop.control.base import SETTLE_FRAMES, OpenLoopTelemetry
 from faintspot.loop.control.identification.layers import Identified
-from faintspot.loop.control.identification.learning import JUDGED_PART, learn_controller
+from faintspot.loop.control.identification.learning import (
+    BLOCK_FRAMES,
+    JUDGED_PART,
+    STANDARD_ERRORS,
+    error_of_mean,
+    learn_controller,
+)
 from faintspot.loop.control.identification.loop_delay import LoopDelay
 from faintspot.loop.control.identification.model import Kalman
 from faintspot.loop.control.integrator import LoopPlant
 from faintspot.loop.slope_covariance import SlopeTurbulence
 
-STANDARD_ERRORS = 2.0
-_BLOCK_FRAMES = 25
 _FEWEST_BLOCKS = 10
-FEWEST_FRAMES = math.ceil(_FEWEST_BLOCKS * _BLOCK_FRAMES / JUDGED_PART) + 1
+FEWEST_FRAMES = math.ceil(_FEWEST_BLOCKS * BLOCK_FRAMES / JUDGED_PART) + 1
 """Frames of a stretch that can be learnt from and judged on."""
 
 
@@ -116,12 +117,3 @@ def relearn(
     learnt = replace(new, left=(means[0], means[2]), centroid_gain=gain, identified=identified)
     error = error_of_mean(by_running - by_new)
     return RelearntControl(learnt, *means, error, delay, changed)
-
-
-def error_of_mean(values: Floats) -> float:
-    """Return the standard error of the mean of correlated values, from the scatter of blocks."""
-    blocks = len(values) // _BLOCK_FRAMES
-    means = values[: blocks * _BLOCK_FRAMES].reshape(blocks, _BLOCK_FRAMES).mean(axis=1)
-    with np.errstate(invalid="ignore"):
-        error = float(means.std(ddof=1)) / math.sqrt(blocks)
-    return error if math.isfinite(error) else math.inf

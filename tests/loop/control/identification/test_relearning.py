@@ -8,10 +8,10 @@ from tests.loop.control.control_cases import FRAME_S, LAYERS, PLANT, TURBULENCE,
 from tests.refusals import refused
 
 from faintspot.loop.control.base import ASSUMED
-from faintspot.loop.control.identification.learning import learn_controller
+from faintspot.loop.control.identification.learning import error_of_mean, learn_controller
 from faintspot.loop.control.identification.loop_delay import LoopDelay
 from faintspot.loop.control.identification.model import Kalman
-from faintspot.loop.control.relearning import error_of_mean, relearn
+from faintspot.loop.control.relearning import relearn
 
 RATE_HZ = 1 / FRAME_S
 FRAMES = telemetry(1200, 0.3, model=LAYERS)

@@ -15,7 +15,7 @@ from faintspot.base.errors import InputError
 from faintspot.loop.control.base import SETTLE_FRAMES, CommandDelayLine
 from faintspot.loop.control.beside_the_loop import FRAMES, BesideTheLoop, RecentFrames, replayed_slopes
 from faintspot.loop.control.identification.layers import Identified
-from faintspot.loop.control.identification.learning import JUDGED_PART
+from faintspot.loop.control.identification.learning import JUDGED_PART, STANDARD_ERRORS, error_of_mean
 from faintspot.loop.control.identification.learnt_loop import (
     ObservedLoop,
     control_from_observed,
@@ -28,7 +28,6 @@ from faintspot.loop.control.identification.modal_model import LoopOfControl
 from faintspot.loop.control.identification.model import Kalman, state_space, write_matrices
 from faintspot.loop.control.identification.open_loop import Measured, Wind, open_loop_of
 from faintspot.loop.control.identification.recording import OFFSETS, Recording
-from faintspot.loop.control.relearning import STANDARD_ERRORS, error_of_mean
 
 Singles = NDArray[np.float32]
 
