@@ -40,7 +40,7 @@ MEASURE = "slopes frames.npy --config faintspot.toml -o slopes.zarr"
                 MEASURE,
                 f"{MEASURE} --overwrite",
                 *2 * ("slopes frames.npy --config faintspot.toml -o slopes.npz --overwrite",),
-                *2 * ("wavefront slopes.zarr -o wavefront.json",),
+                "wavefront slopes.zarr -o wavefront.json",
                 "study study.toml --workers 2",
                 "layout frames.npy --grid 4x4 --pixels 8 -o new.toml --overwrite",
                 "realtime run",
