@@ -26,6 +26,7 @@ REQUESTS: list[tuple[str, Fields, tuple[str, ...]]] = [
     ("set", {"changes": {"search_range_px": np.nan}}, ("search_range_px", "NaN")),
     ("set", {"changes": {"estimator": "ml"}}, ("psf",)),
     ("set", {"changes": {"threshold_e": [1.0, 2.0]}}, ("threshold_e", "'thresholded'", "'tv'")),
+    ("set", {"changes": {"flux_e": [1.0, 2.0]}}, ("flux_e", "16", "2")),  # not in use now, but it would stay
     ("set", {"changes": {"noise_std": 1}, "where": []}, ("where",)),
     ("set", {"changes": {"noise_std": 1}, "where": {"a": 1}}, ("where",)),
     ("set", {"changes": {"threshold_e": 1}, "where": [99]}, ("where", "sub-aperture 99")),

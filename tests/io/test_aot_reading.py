@@ -174,7 +174,7 @@ def test_the_example_of_aotpy(tmp_path: Path) -> None:
         assert frames.shape == (2, 4)
     with refused("e.fits: sensor 'WFS1'", "[layout] in ", "none.toml"):
         measure_recorded([tmp_path / "e.fits"], tmp_path / "none.toml", tmp_path / "s.npz")
-    with refused("'WFS2': expected frames (pixel_intensities"):
+    with refused("'WFS2'", "pixel_intensities"):
         open_frames([tmp_path / "e.fits"], key="WFS2")
 
 
@@ -245,33 +245,30 @@ MASK = np.array([[7, 2, -1], [0, -1, 1], [-1, 3, -1]])
 
 
 @pytest.mark.parametrize(
-    ("change", "naming"),
+    ("change", "names"),
     mostly_slow(
         1,
         [
-            (changed("sensor.detector", None), "one Shack-Hartmann sensor with pixels, it has: WFS1, WFS2"),
-            (pyramid, "it has: none"),
-            (changed("sensor.subaperture_mask.data", MASK), "subaperture_mask: expected the numbers 0 to 3"),
-            (changed("sensor.ref_measurements.data", np.zeros((4, 2))), "expected shape (2, 4), got (4, 2)"),
-            (
-                changed("sensor.measurements.data", np.ones((50, 4, 2))),
-                "measurements: expected shape (t, 2, 4)",
-            ),
-            (changed("loop.interaction_matrix.data", np.ones((3, 2, 4))), "expected shape (4, 2, commands)"),
-            (changed("sensor.mask_offsets", 2 * [aotpy.Coordinates(2.0, 1.0)]), "expected one, got 2"),
-            (changed("sensor.detector.pixel_intensities.data", np.ones(20)), "(frames, height, width)"),
+            (changed("sensor.detector", None), ("Shack-Hartmann", "WFS1, WFS2")),
+            (pyramid, ("Shack-Hartmann", "none")),
+            (changed("sensor.subaperture_mask.data", MASK), ("subaperture_mask", "0 to 3")),
+            (changed("sensor.ref_measurements.data", np.zeros((4, 2))), ("(2, 4)", "(4, 2)")),
+            (changed("sensor.measurements.data", np.ones((50, 4, 2))), ("measurements", "(t, 2, 4)")),
+            (changed("loop.interaction_matrix.data", np.ones((3, 2, 4))), ("(4, 2, commands)",)),
+            (changed("sensor.mask_offsets", 2 * [aotpy.Coordinates(2.0, 1.0)]), ("one", "2")),
+            (changed("sensor.detector.pixel_intensities.data", np.ones(20)), ("(frames, height, width)",)),
         ],
     ),
 )
-def test_damaged_files_are_refused(tmp_path: Path, change: Callable[[Any], None], naming: str) -> None:
-    with refused(naming):
+def test_damaged_files_are_refused(tmp_path: Path, change: Callable[[Any], None], names: Any) -> None:
+    with refused("e.fits", *names):
         read_aot(example(tmp_path / "e.fits", change))
 
 
 def test_subapertures_outside_the_frame_are_refused(tmp_path: Path) -> None:
     fs.Settings("centroid").save(tmp_path / "faintspot.toml")
     path = example(tmp_path / "e.fits", changed("sensor.mask_offsets", [aotpy.Coordinates(5.0, 1.0)]))
-    with refused("'WFS1': layout: sub-aperture 1 ", "leaves the frame"):
+    with refused("'WFS1'", "layout", "sub-aperture 1"):
         measure_recorded([path], tmp_path / "faintspot.toml", tmp_path / "s.npz")
 
 
@@ -296,12 +293,10 @@ def test_what_is_no_aot_file(tmp_path: Path) -> None:
     (tmp_path / "text.fits").write_text("text")
     (tmp_path / "unknown.fits").write_bytes(content.replace(b"AOT_SOURCES", b"AOT_SAUCES "))
     (tmp_path / "cut.fits").write_bytes(content[: len(content) // 3])
-    for name, sensor, words in (
-        ("absent", None, "no such file"),
-        ("text", None, "AOT-VERS"),
-        ("e", "WFS7", "a Shack-Hartmann sensor 'WFS7', it has: WFS1, WFS2"),
-        ("unknown", None, "not valid"),
-        ("cut", None, "not valid"),
+    for name, sensor, names in (
+        *((name, None, ()) for name in ("absent", "unknown", "cut")),
+        ("text", None, ("AOT-VERS",)),
+        ("e", "WFS7", ("'WFS7'", "WFS1, WFS2")),
     ):
-        with refused(words):
+        with refused(f"{name}.fits", *names):
             read_aot(tmp_path / f"{name}.fits", sensor)

@@ -74,12 +74,13 @@ def table(path: Path, header: Any = None, **columns: Any) -> Path:
 NAMES = ("HODM_Positions", "DSM_Positions", "DM_Positions", "ModalCoefficients", "Positions", "IFM_Positions")
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_commands_of_other_tables(tmp_path: Path, name: str) -> None:
-    values = read_layout(table(tmp_path / "t.fits", Gradients=LOOP.slopes, **{name: LOOP.commands}), {})
-    np.testing.assert_array_equal(values["commands"], LOOP.commands)
-    assert values["sources"]["commands"] == name
-    assert "time_s" not in values
+def test_commands_of_other_tables(tmp_path: Path) -> None:
+    for name in NAMES:
+        path = table(tmp_path / f"{name}.fits", Gradients=LOOP.slopes, **{name: LOOP.commands})
+        values = read_layout(path, {})
+        np.testing.assert_array_equal(values["commands"], LOOP.commands)
+        assert values["sources"]["commands"] == name
+        assert "time_s" not in values
 
 
 def test_numbers_and_times_that_do_not_rise(tmp_path: Path) -> None:
@@ -145,7 +146,7 @@ def test_layouts_differ_in_their_slopes() -> None:
 def test_several_tables_in_a_folder(tmp_path: Path) -> None:
     for name in "ab":
         table(tmp_path / f"{name}.fits", Gradients=LOOP.slopes, DM_Positions=LOOP.commands)
-    with refused("name one as FILE: a.fits, b.fits"):
+    with refused("a.fits, b.fits"):
         read_layout(tmp_path, {})
 
 
@@ -181,7 +182,7 @@ def test_keck_tip_tilt(tmp_path: Path) -> None:
 
 def test_keck_has_two_loops(tmp_path: Path) -> None:
     path = loop_layouts.keck_high_order(tmp_path, LOOP)
-    with refused("has 2 loops; choose one with --slopes: A.OFFSETCENTROID, A.RESIDUALWAVEFRONT"):
+    with refused("--slopes", "A.OFFSETCENTROID, A.RESIDUALWAVEFRONT"):
         read_layout(path, {})
     values = read_layout(path, {"slopes": "a.offsetcentroid"})
     np.testing.assert_allclose(values["slopes"], pairs(LOOP.slopes), rtol=1e-6)

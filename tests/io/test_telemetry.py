@@ -109,10 +109,10 @@ def test_damage_is_said_and_never_read_as_other_telemetry(store: TelemetryStore)
         content = chunk.read_bytes()
         place = len(content) // 2
         chunk.write_bytes(content[:place] + bytes([content[place] ^ 4]) + content[place + 1 :])
-        with refused("the store is damaged"):
+        with refused(store.path.name, "damaged"):
             read_telemetry(store.path)
         chunk.unlink()
-        with refused("is lost"):
+        with refused(store.path.name, "lost"):
             read_telemetry(store.path)
         chunk.write_bytes(content)
     assert len(read_telemetry(store.path).frame) == 15
@@ -161,17 +161,16 @@ def test_aot_without_images_and_what_cannot_be_written(tmp_path: Path) -> None:
     aotpy = pytest.importorskip("aotpy")
     store = TelemetryStore(tmp_path / "night.zarr", RECORD, IMAGE, ATTRIBUTES)
     nothing: Telemetry = read_telemetry(store.path)
-    with refused("at least one frame"):
+    with refused("frame"):
         write_aot(tmp_path / "nothing.fits", nothing)
     store.append(records_of(0, 2), images_of(), {})
     telemetry = read_telemetry(store.path)
     write_aot(tmp_path / "night.fits", telemetry)
     system = aotpy.AOSystem.read_from_file(tmp_path / "night.fits")
     assert system.wavefront_sensors[0].detector.pixel_intensities is None
-    with refused("already exists"):
-        write_aot(tmp_path / "night.fits", telemetry)
-    with refused("cannot be written"):
-        write_aot(tmp_path / "no" / "night.fits", telemetry)
+    for path in (tmp_path / "night.fits", tmp_path / "no" / "night.fits"):
+        with refused(f"{path}"):
+            write_aot(path, telemetry)
     with refused("ao_mode"):
         write_aot(tmp_path / "mode.fits", telemetry, ao_mode="scao")
 
