@@ -29,7 +29,7 @@ REQUESTS: list[tuple[str, Fields, tuple[str, ...]]] = [
     ("set", {"changes": {"flux_e": [1.0, 2.0]}}, ("flux_e", "16", "2")),  # not in use now, but it would stay
     ("set", {"changes": {"noise_std": 1}, "where": []}, ("where",)),
     ("set", {"changes": {"noise_std": 1}, "where": {"a": 1}}, ("where",)),
-    ("set", {"changes": {"threshold_e": 1}, "where": [99]}, ("where", "sub-aperture 99")),
+    ("set", {"changes": {"threshold_e": 1}, "where": [16]}, ("where", "sub-aperture 16")),
     ("set", {"changes": {"noise_std": "auto"}, "where": [0]}, ("noise_std",)),
     ("get", {"names": ["rules"]}, ("rules", "rule")),
     ("get", {"names": "rule"}, ("names = 'rule'",)),

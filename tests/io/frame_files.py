@@ -139,7 +139,7 @@ def assert_frames(location: str | Path, frames: NDArray[Any], **options: Any) ->
     with open_frames([location], **options) as source:
         assert (source.n_frames, *source.shape) == frames.shape
         assert source.dtype == frames.dtype.newbyteorder("=")
-        for start in (0, len(frames) // 2, len(frames) - 1):
+        for start in {0, len(frames) // 2}:
             np.testing.assert_array_equal(source.block(start, len(frames)), frames[start:])
         return source.note
 
