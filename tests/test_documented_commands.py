@@ -80,13 +80,13 @@ def test_toml_is_toml() -> None:
 
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a folder with what pages call their files, of a sensor of 10 x 10 lenslets."""
+    """Return a folder with what pages call their files, of a sensor of 7 x 7 lenslets."""
     from astropy.io import fits
 
     folder = tmp_path_factory.mktemp("recorded")
     rng = np.random.default_rng(1)
     layout = fs.Layout.grid(
-        (10, 10), pixels=16, outer_radius=5, inner_radius=1.5, origin=(16, 16), frame_shape=(192, 192)
+        (7, 7), pixels=16, outer_radius=3.5, inner_radius=0.5, origin=(16, 16), frame_shape=(144, 144)
     )
     electrons, _ = sensor_frames(layout, 4, flux_e=3000.0, rng=rng)
     frames = (electrons / 1.9 + rng.normal(100.0, 2.0, electrons.shape)).astype(np.uint16)
@@ -114,8 +114,10 @@ def test_documented_commands_run(
     recorded: Path,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
-    coarse_pictures: None,
+    request: pytest.FixtureRequest,
 ) -> None:
+    """Pictures are drawn on the pages about them."""
+    request.getfixturevalue("coarse_pictures" if "guide" in request.node.name else "undrawn_pictures")
     monkeypatch.chdir(shutil.copytree(recorded, tmp_path / "here"))
     if called[0][0] != "layout":
         os.rename("found.toml", "faintspot.toml")

@@ -12,7 +12,7 @@ AMBIGUOUS = [((220, 220, 150), 2), ((200, 220, 50), 2), ((220, 150, 220), 1)]
 
 
 def stored(folder: Path, shape: tuple[int, ...]) -> tuple[Path, np.ndarray]:
-    cube = np.random.default_rng(1).integers(0, 1000, shape).astype(np.int16)
+    cube = np.random.default_rng(1).integers(0, 250, shape, np.uint8)
     np.save(folder / "a.npy", cube)
     return folder / "a.npy", cube
 

@@ -61,6 +61,7 @@ def test_defaults_in_eyes(folder: Path, run: Commands, seed: int) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("no_trials")
 def test_background_beyond_a_stated_dark_is_reported(folder: Path, run: Commands) -> None:
     """The dark stays as stated, and the width does not follow the reflection."""
     np.save("a.npy", flat_frame(500.0).pixels)
