@@ -1,4 +1,6 @@
+import importlib
 import importlib.metadata
+import sys
 import warnings
 from pathlib import Path
 from typing import Any
@@ -20,7 +22,7 @@ from tests.adapters.adapter_cases import (
 from tests.refusals import refused
 
 import faintspot as fs
-from faintspot import Settings
+from faintspot import MissingExtraError, Settings
 from faintspot.adapters.base import (
     ToolSlopes,
     UntestedVersionWarning,
@@ -217,3 +219,17 @@ def test_windows_are_those_nearest_to_their_lenslets(side: int) -> None:
     centres = np.random.default_rng(1).uniform(20.0, 90.0, (200, 2))
     middles = window_corners(centres, side)[:, ::-1] + 0.5 * (side - 1)
     assert np.abs(middles - centres).max() <= 0.5
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_missing_tool_is_said_in_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    for package, extra, module, name in (
+        ("hcipy", "loop", "hcipy", "SlopeEstimator"),
+        ("specula", "specula", "specula.faintspot_slopec", "FaintspotSlopec"),
+        ("pyrtc", "pyrtc", "pyrtc", "FaintspotSlopes"),
+        ("pyrtc", "pyrtc", "pyrtc", "FaintspotCamera"),
+    ):
+        monkeypatch.setitem(sys.modules, package, None)
+        monkeypatch.delitem(sys.modules, f"faintspot.adapters.{module}", raising=False)
+        with pytest.raises(MissingExtraError, match=rf"faintspot\[{extra}\]"):
+            getattr(importlib.import_module(f"faintspot.adapters.{module}"), name)

@@ -114,7 +114,7 @@ def test_list_and_show(run: Commands) -> None:
 
 
 def test_magnitude_writes_a_page_that_report_makes_again(run: Commands) -> None:
-    given = ("--quick", "--workers", 0, "--methods", "brightest", "-o", "here")
+    given = ("--quick", "--workers", 0, "--methods", "brightest", "--flux-e", "400", "-o", "here")
     result = run.ok("loop", "magnitude", "small.toml", *given)
     assert result.out.splitlines()[1].startswith("brightest pixels")
     assert result.out.splitlines()[-1] == "here/report.html: open it in a browser"
