@@ -25,7 +25,6 @@ OF_THE_PROGRAM = {
     "slopes/kernels/host.py _lanes",
     "slopes/kernels/compiling.py compile_target",
     "slopes/kernels/groups.py driver_of",
-    "slopes/kernels/streaming.py streamed",
     "slopes/kernels/parallel.py _pool",
     "slopes/kernels/total_variation/flat_start.py flat_start_table",
     "slopes/pipeline/slope_pipeline.py _checks",

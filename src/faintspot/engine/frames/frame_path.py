@@ -81,11 +81,12 @@ class _Groups:
         """Arguments of the kernels for each slot."""
         self._explaining = [arguments._replace(stages=stages) for arguments in self.arguments]
         self._width, self._frame_rows = pipeline.width, int(last_rows_of_groups(pipeline, 1).max())
-        self._kernel = Direct(streaming.streamed(pipeline.plan.prepared.kernel))
+        self._stream = Direct(streaming.stream_groups)
         self._multiply = Direct(streaming.multiply_until)
         self._sleep = Direct(streaming.sleep_until_due)
         self._due = np.zeros(len(self._last_rows), np.int64)
         self._scratch = [pipeline.new_scratch() for _ in range(shares)]
+        self._kernel = pipeline.plan.kernel.address(*self.arguments[0].measuring(0, 0, self._scratch[0]))
 
     def measure(
         self,
@@ -111,7 +112,7 @@ class _Groups:
 
         def stream(awaited: int, first: int, end: int) -> int:
             groups = work.measuring(first, end, self._scratch[share])
-            done: int = self._kernel(arrival, awaited, self._last_rows, *groups, part)
+            done: int = self._stream(self._kernel, arrival, awaited, self._last_rows, *groups, part)
             return done
 
         pace[streaming.PENDING] = start

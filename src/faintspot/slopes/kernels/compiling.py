@@ -263,10 +263,19 @@ class Direct:
     def __call__(self, *arguments: Any) -> Any:
         """Call the kernel."""
         if self._entry is None:
-            signature = tuple(writable_type(self._kernel.typeof_pyval(argument)) for argument in arguments)
-            self._kernel.compile(signature)
-            self._entry = self._kernel.overloads[signature].entry_point
+            self._entry = self._compiled(arguments).entry_point
         return self._entry(*arguments)
+
+    def address(self, *arguments: Any) -> int:
+        """Return the address of the kernel's machine code, for kernels that call it with such arguments."""
+        result = self._compiled(arguments)
+        address: int = result.library.get_pointer_to_function(result.fndesc.llvm_func_name)
+        return address
+
+    def _compiled(self, arguments: tuple[Any, ...]) -> Any:
+        signature = tuple(writable_type(self._kernel.typeof_pyval(argument)) for argument in arguments)
+        self._kernel.compile(signature)
+        return self._kernel.overloads[signature]
 
 
 types: Any = numba_types  # as far as mypy knows, a part of it is missing

@@ -304,13 +304,8 @@ def driver_of(kernel: Any) -> Any:
     A copy with globals and a name of its own: Numba's disk cache finds it again in a new process, which it
     does not for a closure or for a kernel that is passed as an argument.
     """
-    return copied(measure_groups, kernel, locate=kernel)
-
-
-def copied(template: Any, kernel: Any, **replaced: Any) -> Any:
-    """Return a compiled copy of a template for a kernel, with other functions in place of its globals."""
-    own = kernel.py_func
-    copy = FunctionType(template.__code__, {**template.__globals__, **replaced}, template.__name__)
+    own, template = kernel.py_func, measure_groups
+    copy = FunctionType(template.__code__, {**template.__globals__, "locate": kernel}, template.__name__)
     copy.__qualname__ = f"{template.__name__}_{own.__module__.replace('.', '_')}_{own.__qualname__}"
     copy.__module__ = template.__module__
     return compiled_with(copy, own.__code__.co_filename)

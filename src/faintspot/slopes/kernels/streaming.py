@@ -11,16 +11,15 @@ Of the product of a reconstructor with the slopes, as much is computed as the ti
 groups whose rows are there are measured first.
 """
 
-from functools import cache
 from typing import Any, NamedTuple
 
 import llvmlite.binding as llvm
 from llvmlite import ir
-from numba.core import types
+from numba.core import cgutils, types
 
 from faintspot.base.arrays import Array
 from faintspot.slopes.kernels.compiling import compiled
-from faintspot.slopes.kernels.groups import Scratch, SlopeArrays, Source, Task, copied
+from faintspot.slopes.kernels.groups import Scratch, SlopeArrays, Source, Task
 from faintspot.slopes.kernels.ordered import look_at, now_ns, sleep_ns
 from faintspot.slopes.kernels.products import ProductPart, add_slopes
 from faintspot.slopes.kernels.simd import intrinsic, width_of
@@ -167,13 +166,34 @@ def multiply_until(
         pace[PENDING] += 1
 
 
-def measure(
-    source: Source, task: Task, start: int, stop: int, scratch: Scratch, slopes: SlopeArrays, stages: Array
-) -> None:
-    """Stand for the compiled function that measures groups, which `streamed` puts in its place."""
+@intrinsic
+def _measure_at(
+    typing_context: Any,
+    address: Any,
+    source: Any,
+    task: Any,
+    start: Any,
+    stop: Any,
+    scratch: Any,
+    slopes: Any,
+    stages: Any,
+) -> Any:
+    """Call the machine code at an address as `groups.measure_groups`; see `compiling.Direct.address`."""
+    kinds = (source, task, types.int64, types.int64, scratch, slopes, stages)
+
+    def emit(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        kind = context.call_conv.get_function_type(types.none, kinds)
+        outputs = [cgutils.alloca_once(builder, output.pointee) for output in kind.args[:2]]
+        packed = context.get_arg_packer(kinds).as_arguments(builder, args[1:])
+        builder.call(builder.inttoptr(args[0], kind.as_pointer()), [*outputs, *packed])
+        return context.get_dummy_value()
+
+    return types.void(types.int64, *kinds), emit
 
 
+@compiled
 def stream_groups(
+    measure: int,
     arrival: Arrival,
     frame: int,
     last_rows: Array,
@@ -190,6 +210,9 @@ def stream_groups(
 
     Parameters
     ----------
+    measure : int
+        Address of the compiled function that measures groups. That is not made part of this one, which would
+        be compiled for every estimator.
     arrival : Arrival
     frame : int
         Number of the frame to measure.
@@ -210,11 +233,5 @@ def stream_groups(
         sleep_until_due(arrival, frame, last_rows[item], item)
         if not wait_for_group(arrival, frame, last_rows[item], item):
             return item
-        measure(source, task, item, item + 1, scratch, slopes, stages)
+        _measure_at(measure, source, task, item, item + 1, scratch, slopes, stages)
     return stop
-
-
-@cache
-def streamed(kernel: Any) -> Any:
-    """Return `stream_groups` for a compiled function that measures groups; see `groups.copied`."""
-    return copied(stream_groups, kernel, measure=kernel)
