@@ -152,7 +152,9 @@ def _as_on_windows(folder: str, event: str, arguments: tuple[Any, ...]) -> None:
         if event == "open" and arguments[1] is None and os.path.isdir(name):
             raise PermissionError(13, "Permission denied", name)
         mapped_only = event == "open" and not name.endswith(".lock")
-        if (changes or "w" in str(arguments[1])) and _is_open(name, mapped_only=mapped_only):
+        if not (changes or "w" in str(arguments[1])) or not os.path.lexists(name):
+            continue
+        if _is_open(name, mapped_only=mapped_only):
             raise PermissionError(13, "The file is used by another process", name)
 
 

@@ -41,7 +41,7 @@ MEASURE = "slopes frames.npy --config faintspot.toml -o slopes.zarr"
                 f"{MEASURE} --overwrite",
                 *2 * ("slopes frames.npy --config faintspot.toml -o slopes.npz --overwrite",),
                 "wavefront slopes.zarr -o wavefront.json",
-                "study study.toml --workers 2",
+                "study study.toml --workers 1",
                 "layout frames.npy --grid 4x4 --pixels 8 -o new.toml --overwrite",
                 "realtime run",
             ),
