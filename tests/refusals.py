@@ -31,7 +31,7 @@ def refusal(call: Callable[[], object]) -> str:
     return ""
 
 
-def assert_all_refused(rows: Iterable[tuple[Any, tuple[str, ...]]], refusal: Callable[[Any], str]) -> None:
+def assert_all_refused(rows: Iterable[tuple[Any, tuple[str, ...]]], message_of: Callable[[Any], str]) -> None:
     """Expect that what is given in each row is refused: in one line that has the row's names and values.
 
     Besides those, the line has words: what was expected, or what to do. All rows that fail are reported.
@@ -39,7 +39,7 @@ def assert_all_refused(rows: Iterable[tuple[Any, tuple[str, ...]]], refusal: Cal
     faults = []
     for given, names in rows:
         try:
-            message = rest = refusal(given)
+            message = rest = message_of(given)
         except Exception as error:
             faults.append(f"{given!r:.120}: {type(error).__name__} {error}")
             continue

@@ -48,7 +48,7 @@ def test_slopes_are_those_of_python_in_every_bit(sensor: Sensor, built: Path, th
         for name, (values, estimator) in chosen.items():
             darc.switch(base | values)
             darc.next(3)
-            numbers, slopes = darc.next(2000 if name.startswith("faintspot, TV") else 200)
+            numbers, slopes = darc.next(1000 if name.startswith("faintspot, TV") else 200)
             assert np.all(np.diff(numbers) == 1), name
             which = aligned(numbers, slopes, sensor)
             expected, python = sensor.expected(estimator), sensor.pipelines[estimator](sensor.frames)

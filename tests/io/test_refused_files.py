@@ -52,7 +52,7 @@ def put(path: Path, content: Any) -> None:
 
 
 def cut(content: Any, length: int) -> Write:
-    """Return what writes a file without its end, or only the end of which is missing."""
+    """Return what writes a file as far as this number of bytes, counted from the end where it is negative."""
 
     def cut_short(path: Path) -> None:
         put(path, content)
