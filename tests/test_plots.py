@@ -105,7 +105,7 @@ def test_a_psf_is_drawn_about_the_spot(axes: Axes) -> None:
 
 @pytest.mark.slow  # which measures its delay
 def test_a_recording_draws_the_noise_of_x_and_y(axes: Axes) -> None:
-    recording = recorded(frames=700)
+    recording = recorded(frames=500)
     places = recording.plot()
     noise = np.array([place.images[0].get_array() for place in places])
     assert noise.shape == (2, 5, 5)
