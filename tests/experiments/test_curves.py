@@ -12,7 +12,6 @@ from scipy.interpolate import PchipInterpolator
 from scipy.optimize import brentq
 from tests.refusals import refused
 
-from faintspot.base.errors import InputError
 from faintspot.experiments.curves import (
     Curve,
     Gain,
@@ -49,31 +48,24 @@ def with_scatter(method_flux: float, n: int = 2000) -> Curve:
     return Curve.of_errors(flux, of)
 
 
-@given(st.floats(1.0, 1.9), st.floats(0.3, 1.0), st.floats(25.0, 150.0))
+@given(st.floats(0.8, 1.9), st.floats(0.3, 1.0), st.floats(25.0, 125.0))
 def test_gain_of_power_laws(ratio: float, power: float, at: float) -> None:
     """R = a * flux^-power is a straight line in log-log, reproduced to the 1e-9 that makes curves fall."""
     curve = exact(2.0 * FLUX**-power, 2.0 * (ratio * FLUX) ** -power)
     assert gain(curve, at).factor == pytest.approx(ratio, rel=1e-7)
 
 
-def test_gain_below_one_where_the_method_is_worse() -> None:
-    assert gain(exact(1 / FLUX, 1.25 / FLUX), 40.0).factor == pytest.approx(0.8, rel=1e-7)
-
-
-@pytest.mark.parametrize("at", [10.0, 25.0, 55.0, 160.0])
-@pytest.mark.parametrize("values", [[0.5, 0.49, 0.3, 0.1, 0.09], [0.5, 0.3, 0.3, 0.31, 0.1]])
-def test_gain_of_equal_curves_is_one_whatever_their_shape(values: list[float], at: float) -> None:
-    assert gain(exact(values, values), at).factor == pytest.approx(1.0, rel=1e-3)
-
-
-@pytest.mark.parametrize("at", [25.0, 60.0, 130.0])
-def test_gain_is_where_the_interpolated_curves_say(at: float) -> None:
-    """The grid's step is 0.3 % of flux; linear interpolation within it is far better."""
+def test_gain_is_where_the_interpolated_curves_say() -> None:
+    """The grid's step is 0.3 % of flux; linear interpolation within it is far better. Equal curves: 1."""
+    for values in ([0.5, 0.49, 0.3, 0.1, 0.09], [0.5, 0.3, 0.3, 0.31, 0.1]):
+        gains = [gain(exact(values, values), at).factor for at in (10.0, 25.0, 55.0, 160.0)]
+        assert gains == pytest.approx([1.0] * 4, rel=1e-3)
     reference, method = np.array([0.5, 0.35, 0.2, 0.1, 0.06]), np.array([0.4, 0.25, 0.13, 0.08, 0.05])
-    wanted = PchipInterpolator(np.log(FLUX), np.log(reference))(np.log(at))
     curve = PchipInterpolator(np.log(FLUX), np.log(method))
-    needed = math.exp(brentq(lambda place: curve(place) - wanted, *np.log(FLUX[[0, -1]])))
-    assert gain(exact(reference, method), at).factor == pytest.approx(at / needed, rel=1e-3)
+    for at in (25.0, 60.0, 130.0):
+        wanted = PchipInterpolator(np.log(FLUX), np.log(reference))(np.log(at))
+        needed = math.exp(brentq(lambda place, wanted=wanted: curve(place) - wanted, *np.log(FLUX[[0, -1]])))
+        assert gain(exact(reference, method), at).factor == pytest.approx(at / needed, rel=1e-3)
 
 
 def test_an_error_beyond_the_curve_of_the_method_is_said() -> None:
@@ -120,12 +112,12 @@ def test_half_the_flux_is_three_quarters_of_a_magnitude() -> None:
     assert itself.value == 0.0
 
 
-@pytest.mark.parametrize(("flux", "expected"), [(0.01, math.inf), (1e4, -math.inf)])
-def test_gain_beyond_the_curve_has_a_sign(flux: float, expected: float) -> None:
+def test_gain_beyond_the_curve_has_a_sign() -> None:
     options: Any = {"method": "method", "reference": "reference"}
-    found = magnitude_gain(with_scatter(flux), 100.0, np.random.default_rng(3), **options)
-    assert found.value == expected
-    assert math.isnan(magnitude_gain(with_scatter(flux), 5.0, np.random.default_rng(3), **options).value)
+    for flux, expected in ((0.01, math.inf), (1e4, -math.inf)):
+        curve, rng = with_scatter(flux), np.random.default_rng(3)
+        assert magnitude_gain(curve, 100.0, rng, **options).value == expected
+        assert math.isnan(magnitude_gain(curve, 5.0, rng, **options).value)
 
 
 def test_limiting_flux_has_its_error() -> None:
@@ -150,21 +142,22 @@ def test_covariance_is_that_of_the_means() -> None:
 
 
 def test_bad_input_is_refused() -> None:
-    for flux, errors, words in (
-        (FLUX[::-1], np.ones((5, 3)), "expected at least two increasing"),
-        ([10.0], np.ones((1, 3)), "expected at least two increasing"),
+    for flux, errors, word in (
+        (FLUX[::-1], np.ones((5, 3)), "increasing"),
+        ([10.0], np.ones((1, 3)), "increasing"),
         ([0.0, 1.0], np.ones((2, 3)), "flux_e = 0"),
-        (FLUX, np.ones((4, 3)), r"one shape \(5, n\)"),
-        (FLUX, np.ones(5), r"one shape \(5, n\)"),
+        (FLUX, np.ones((4, 3)), "(5, n)"),
+        (FLUX, np.ones(5), "(5, n)"),
     ):
-        with pytest.raises(InputError, match=words):
+        with refused(word):
             Curve.of_errors(flux, {"a": errors})
     curve, rng = exact(1 / FLUX, 1 / FLUX), np.random.default_rng(1)
-    with refused("'reference' and 'magic'"):
-        gain_at_flux(curve, 80.0, rng, method="magic", reference="reference")
-    with refused("flux_e"):
-        gain_at_flux(curve, 0.0, rng, method="method", reference="reference")
-    with refused("error_px"):
-        gain_at_error(curve, 0.0, rng, method="method", reference="reference")
-    with refused("method 'magic'"):
+    for function, at, method, word in (
+        (gain_at_flux, 80.0, "magic", "'magic'"),
+        (gain_at_flux, 0.0, "method", "flux_e"),
+        (gain_at_error, 0.0, "method", "error_px"),
+    ):
+        with refused(word):
+            function(curve, at, rng, method=method, reference="reference")
+    with refused("'magic'"):
         curve.of("magic")

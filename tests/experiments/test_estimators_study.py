@@ -73,15 +73,10 @@ def test_estimator_figures_have_their_panels() -> None:
     rings = [line for line in turbulence.axes[0].lines if line.get_markersize() == 15]
     np.testing.assert_allclose(np.asarray(rings[0].get_xdata(), float), [0.5, 1, 3])
     assert all(figure.caption and figure.csv for figure in made.values())
-
-
-def test_unfinished_studies_are_drawn_as_far_as_they_are() -> None:
+    # Unfinished studies are drawn as far as they are; other studies do not compare estimators.
     assert list(estimator_figures(study(unfinished=range(21)))) == []
     names = [figure.name for figure in estimator_figures(study(unfinished=range(3, 21)))]
     assert names == ["estimators-diffraction"]
-
-
-def test_other_studies_do_not_compare_estimators() -> None:
     assert compares_estimators(study())
     assert not compares_estimators(dataset(cells(), error))
 

@@ -1,8 +1,7 @@
 """The paper's study: its cells and its report."""
 
-import pytest
+from tests.refusals import refused
 
-from faintspot.base.errors import InputError
 from faintspot.experiments.study.specification import FIGURES, paper_study
 
 
@@ -26,26 +25,16 @@ def test_cost_is_bounded() -> None:
     assert len(paper_study(quick=True).cells()) <= 40
 
 
-@pytest.mark.parametrize("quick", [False, True])
-def test_figure_five_needs_cells_of_its_own_for_faint_spots_at_much_noise_only(quick: bool) -> None:
+def test_one_figure_has_its_own_sweeps() -> None:
+    """Figure 5 needs cells of its own for faint spots at much noise only."""
     others = [name for name in FIGURES if name != "fig5"]
-    with_it, without = paper_study(quick), paper_study(quick, others)
-    extra = set(with_it.cells()) - set(without.cells())
-    assert {(cell.flux_e, cell.read_noise_e) for cell in extra} == (set() if quick else {(50, 16)})
-
-
-@pytest.mark.parametrize("quick", [False, True])
-def test_one_figure_has_its_own_sweeps(quick: bool) -> None:
-    for name in FIGURES:
-        sweeps = paper_study(quick, [name]).sweeps
-        assert sweeps
-        assert all(sweep.name.startswith(name) for sweep in sweeps)
-
-
-@pytest.mark.parametrize(
-    ("figures", "message"),
-    [(["fig9"], "figure = 'fig9'"), (["fig1"], "needs no study"), ([], "at least one")],
-)
-def test_bad_figures_are_refused(figures: list[str], message: str) -> None:
-    with pytest.raises(InputError, match=message):
-        paper_study(figures=figures)
+    for quick, own in ((False, {(50, 16)}), (True, set())):
+        extra = set(paper_study(quick).cells()) - set(paper_study(quick, others).cells())
+        assert {(cell.flux_e, cell.read_noise_e) for cell in extra} == own
+        for name in FIGURES:
+            sweeps = paper_study(quick, [name]).sweeps
+            assert sweeps
+            assert all(sweep.name.startswith(name) for sweep in sweeps)
+    for figures, word in ((["fig9"], "figure = 'fig9'"), (["fig1"], "fig1"), ([], "figure")):
+        with refused(word):
+            paper_study(figures=figures)

@@ -77,10 +77,10 @@ def test_noise_alone_and_two_subapertures(slopes: np.ndarray) -> None:
     assert abs(strength.r0_m - AIR.r0_m) < 3 * strength.r0_error_m
 
 
-@pytest.mark.parametrize("seed", range(6))
-def test_noise_alone_has_no_strength(seed: int) -> None:
-    noise = np.random.default_rng(seed).standard_normal((1200, 72))
-    assert np.isnan(turbulence_strength(noise, noise, np.zeros(1200, np.int64), AIR).r0_m)
+def test_noise_alone_has_no_strength() -> None:
+    for seed in range(6):
+        noise = np.random.default_rng(seed).standard_normal((1200, 72))
+        assert np.isnan(turbulence_strength(noise, noise, np.zeros(1200, np.int64), AIR).r0_m)
 
 
 ROUND_CELLS = np.argwhere(np.hypot(*(np.indices((7, 7)) - 3)) < 3.6)
@@ -106,31 +106,22 @@ def test_r0_of_independent_frames_with_noise_and_vibration(r0_m: float, outer_sc
     assert 0.01 < error / r0 < 0.05
 
 
-def test_noise_alone_has_no_r0() -> None:
-    slopes = np.random.default_rng(2).normal(0, 1.0, (500, 2 * len(ROUND_CELLS)))
-    assert np.isnan(
-        differential_image_motion(slopes, np.full(2 * len(ROUND_CELLS), 1.1), site(0.1), 10.0)
-    ).all()
-    nothing = differential_image_motion(slopes, np.full(2 * len(ROUND_CELLS), 1.1), site(0.1), 10.0)
-    assert np.isnan(nothing).all()
+def test_noise_alone_and_near_sub_apertures_have_no_r0() -> None:
+    noise, slopes = np.full(2 * len(ROUND_CELLS), 1.1), 2 * len(ROUND_CELLS)
+    seen = np.random.default_rng(2).normal(0, 1.0, (500, slopes))
+    assert np.isnan(differential_image_motion(seen, noise, site(0.1), 10.0)).all()
+    pair = replace(site(0.1), positions_m=np.array([[0.0, 0.0], [0.6, 0.0]]))
+    assert np.isnan(differential_image_motion(seen[:, :4], np.zeros(4), pair, 10.0)).all()
 
 
-def test_sub_apertures_that_are_too_near_tell_nothing() -> None:
-    turbulence = SlopeTurbulence(
-        np.array([[0.0, 0.0], [0.6, 0.0]]), 0.6, ARCSEC, 0.1, 25.0, np.ones(1), np.zeros((1, 2))
-    )
-    slopes = np.random.default_rng(3).normal(0, 1.0, (500, 4))
-    assert np.isnan(differential_image_motion(slopes, np.zeros(4), turbulence, 10.0)).all()
-
-
-RATE_HZ, SECONDS, PIECES, NOISE_PX = 60.0, 3.0, 16, 0.3
+RATE_HZ, SECONDS, PIECES, NOISE_PX = 60.0, 3.0, 10, 0.3
 WINDS = {"fast": ([0.5, 0.3, 0.2], [[5.6, 2.1], [-4.1, 11.3], [-12.9, -15.3]]), "slow": ([1.0], [[3.5, 2.0]])}
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", list(WINDS))
 def test_intervals_of_pieces_hold(kind: str) -> None:
-    """At least 12 of 16 intervals (fewer once in 1000 times, if 95 % hold), median r0 within 10 %.
+    """At least 7 of 10 intervals (fewer once in 1000 times, if 95 % hold), median r0 within 10 %.
 
     The mean of a piece takes up to a third of the variance; without it r0 is 5 to 14 % too large.
     """
@@ -149,6 +140,6 @@ def test_intervals_of_pieces_hold(kind: str) -> None:
         found.append([(strength.r0_m, strength.r0_error_m), motion])
     r0, error = np.moveaxis(np.array(found), 2, 0)
     away = np.abs(np.log(r0 / [air.r0_m, 1.04 * air.r0_m])) / (error / r0)  # an outer scale of 25 m adds 4 %
-    assert ((away < 1.96).mean(axis=0) >= 0.75).all()
-    assert (away.std(axis=0) > 0.3).all()  # not too wide either
+    assert ((away < 1.96).mean(axis=0) >= 0.7).all()
+    assert (away.std(axis=0) > 0.2).all()  # not much too wide either
     assert abs(math.log(np.median(r0[:, 0]) / air.r0_m)) < 0.1

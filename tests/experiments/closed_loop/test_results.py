@@ -13,7 +13,6 @@ from tests.experiments.result_cases import made_up_magnitude
 from tests.patience import mostly_slow
 from tests.refusals import refused
 
-from faintspot.base.errors import InputError
 from faintspot.base.statistics import mean_by_blocks
 from faintspot.experiments.closed_loop.results import (
     LOOP_GAIN,
@@ -56,11 +55,10 @@ def test_magnitude_is_read_as_written(tmp_path: Path) -> None:
 
 
 def test_folders_that_cannot_be(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="does not exist: create it first"):
-        make_folder(tmp_path / "a" / "b")
     (tmp_path / "file").touch()
-    with pytest.raises(InputError, match="cannot be made"):
-        make_folder(tmp_path / "file")
+    for folder in (tmp_path / "a" / "b", tmp_path / "file"):
+        with refused(str(folder)):
+            make_folder(folder)
 
 
 MAGNITUDES = np.linspace(8.0, 13.0, 6)
@@ -78,21 +76,17 @@ def curves(shift: float, realisations: int = 6, scatter: float = 0.02) -> np.nda
 
 @given(numbers)
 def test_falling_is_pool_adjacent_violators(values: np.ndarray) -> None:
+    """Many curves at once are as one by one."""
     pools: list[list[float]] = []
     for value in values:
         pools.append([float(value)])
         while len(pools) > 1 and np.mean(pools[-2]) < np.mean(pools[-1]):
             pools[-2:] = [pools[-2] + pools[-1]]
     expected = np.concatenate([[np.mean(pool)] * len(pool) for pool in pools])
-    np.testing.assert_allclose(falling(values), expected, atol=1e-9)
-    assert (np.diff(falling(values)) <= 1e-12).all()
-
-
-def test_many_curves_at_once_are_as_one_by_one() -> None:
-    many = np.random.default_rng(9).uniform(0, 1, (50, 6))
+    many = np.stack([values, np.sort(values), 0 * values])
+    np.testing.assert_allclose(falling(many)[0], expected, atol=1e-9)
+    assert (np.diff(falling(many)) <= 1e-12).all()
     np.testing.assert_allclose(falling(many), [falling(one) for one in many])
-    together = _crossed(MAGNITUDES, many, 0.5)
-    np.testing.assert_allclose(together, [_crossed(MAGNITUDES, one, 0.5) for one in many])
 
 
 def test_the_limiting_magnitude_lies_between_points() -> None:
@@ -101,6 +95,9 @@ def test_the_limiting_magnitude_lies_between_points() -> None:
     assert _crossed([8, 9, 10], [0.6, 0.5, 0.3], 0.5) == pytest.approx(9.0)
     assert _crossed([8, 9], [0.6, 0.5], 0.4) == math.inf
     assert _crossed([8, 9], [0.3, 0.2], 0.4) == -math.inf
+    many = np.random.default_rng(9).uniform(0, 1, (50, 6))
+    one_by_one = [_crossed(MAGNITUDES, one, 0.5) for one in many]
+    np.testing.assert_allclose(_crossed(MAGNITUDES, many, 0.5), one_by_one)
 
 
 @pytest.mark.parametrize("apart", mostly_slow(1, [0.5, 1.0, 1.5]))
@@ -121,22 +118,24 @@ def test_limits_of_curves_that_bend_hold_within_their_errors(apart: float) -> No
     assert rms < float(np.sqrt(np.square(stated).mean())) < 1.5 * of_lines
 
 
+def bent(faint: ArrayLike, middle: float) -> NDArray[np.float64]:
+    """Return Strehl ratios of six equal runs, (magnitudes, 6)."""
+    curve = 0.6 / (1 + np.exp((np.asarray(faint) - middle) / 0.5))
+    return np.tile(curve[:, None], 6)
+
+
 def test_a_gain_between_curves_that_bend_differently_is_not_that_of_lines() -> None:
-    """Stars 1.5 magnitudes apart: lines are wrong by more than the error, which both results state."""
+    """Stars 1.5 magnitudes apart: lines are wrong by more than the error, which both results state.
+
+    Two stars show no bend, and the interval says so.
+    """
     faint = np.arange(7.0, 14.5, 1.5)
-    one, other = (0.6 / (1 + np.exp((faint - middle) / 0.5)) for middle in (11.0, 10.25))
-    runs, others = (np.tile(curve[:, None], 6) for curve in (one, other))
-    gain = magnitude_gain(faint, runs, others, 0.15)
+    gain = magnitude_gain(faint, bent(faint, 11.0), bent(faint, 10.25), 0.15)
     assert gain.standard_error > 0.02
     assert abs(gain.value - 0.75) < 2 * gain.standard_error
     assert gain.low < 0.75 < gain.high
-
-
-def test_two_stars_show_no_bend_and_the_interval_says_so() -> None:
-    faint = [9.0, 10.5]
-    one, other = (0.6 / (1 + np.exp((np.array(faint) - middle) / 0.5)) for middle in (10.4, 9.8))
-    runs, others = (np.tile(curve[:, None], 6) for curve in (one, other))
-    found = magnitude_gain(faint, runs, others, 0.35)
+    two = [9.0, 10.5]
+    found = magnitude_gain(two, bent(two, 10.4), bent(two, 9.8), 0.35)
     assert found.standard_error == pytest.approx(1.5 * math.sqrt(2 / 12))
     assert found.low < 0.6 < found.high
     assert abs(found.value - 0.6) > 0.05
@@ -154,22 +153,16 @@ def test_the_gain_is_the_shift_between_two_curves() -> None:
 
 
 def test_a_gain_beyond_what_was_measured_is_not_made_up() -> None:
-    assert magnitude_gain(MAGNITUDES, curves(3.0), curves(0.0), 0.35).value == math.inf
-    assert magnitude_gain(MAGNITUDES, curves(0.0), curves(3.0), 0.35).value == -math.inf
-    assert math.isnan(magnitude_gain(MAGNITUDES, curves(3.0), curves(3.0), 0.35).value)
-
-
-def test_an_interval_that_leaves_the_magnitudes_is_open() -> None:
+    """An interval that leaves the magnitudes is open; what is not measured yet is left out."""
+    shifts = (3.0, 0.0), (0.0, 3.0), (3.0, 3.0)
+    gains = [magnitude_gain(MAGNITUDES, curves(one), curves(other), 0.35).value for one, other in shifts]
+    assert gains == pytest.approx([math.inf, -math.inf, math.nan], nan_ok=True)
     found = magnitude_gain(MAGNITUDES, curves(0.9, scatter=0.1), curves(0.0, scatter=0.0), 0.31)
     assert math.isfinite(found.value)
     assert found.high == math.inf
-
-
-def test_what_is_not_measured_yet_is_left_out() -> None:
     missing = curves(0.3)
     missing[0, 2] = np.nan
-    found = magnitude_gain(MAGNITUDES, missing, curves(0.0), 0.45)
-    assert found.value == pytest.approx(0.3)
+    assert magnitude_gain(MAGNITUDES, missing, curves(0.0), 0.45).value == pytest.approx(0.3)
     assert math.isnan(magnitude_gain(MAGNITUDES, missing * np.nan, curves(0.0), 0.45).value)
 
 
@@ -258,11 +251,11 @@ def test_an_estimator_of_ones_own_is_an_method(
     assert record.mean_strehl() > 0.35
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_first_values_are_among_all(name: str) -> None:
-    for each in tuned_values(Method.named(name), small()).values():
-        assert set(each.first) <= set(each.values)
-        assert list(each.values) == sorted(set(each.values))
+def test_first_values_are_among_all() -> None:
+    for name in NAMES:
+        for each in tuned_values(Method.named(name), small()).values():
+            assert set(each.first) <= set(each.values)
+            assert list(each.values) == sorted(set(each.values))
 
 
 def test_unknown_methods_and_missing_values() -> None:

@@ -92,6 +92,7 @@ def test_without_rounds_the_best_coarse_choice(hill: list[Any]) -> None:
 
 @pytest.mark.slow
 def test_is_repeatable_and_stored() -> None:
+    assert_each_refused(Search, coarse_frames=[60], frames=[60, 100.5], rounds=[-1], climbs=[0])
     centroid = Method.named("centroid")
     one, other = (tune(centroid, small(), SEARCH) for _ in range(2))
     assert stored(one) == stored(other)
@@ -99,20 +100,13 @@ def test_is_repeatable_and_stored() -> None:
     assert 0 < one["strehl"] < 1
 
 
-def test_search_is_checked() -> None:
-    assert_each_refused(Search, coarse_frames=[60], frames=[60, 100.5], rounds=[-1], climbs=[0])
-
-
-def test_control_that_learns_takes_the_slopes_that_were_tuned(hill: list[Any]) -> None:
-    kind = Method.named("brightest+kalman")
-    found = tuned(kind, Search(rounds=9), {LOOP_GAIN: 0.9, "keep_brightest": BEST + 1})
-    highest = max(tuned_values(kind, small())[LOOP_GAIN].values)
-    assert found.choice == {LOOP_GAIN: highest, "keep_brightest": BEST + 1}
-    assert not hill  # nothing is left to tune
-
-
 def test_of_known_slopes_only_the_gain_is_tuned(hill: list[Any]) -> None:
+    """And nothing of control that learns."""
     slopes = {LOOP_GAIN: GAINS.values[-3], "keep_brightest": BEST + 1}
+    kind = Method.named("brightest+kalman")
+    highest = max(tuned_values(kind, small())[LOOP_GAIN].values)
+    assert tuned(kind, Search(rounds=9), slopes).choice == {**slopes, LOOP_GAIN: highest}
+    assert not hill
     assert tuned(BRIGHTEST, Search(), slopes).choice == {**slopes, LOOP_GAIN: TOP}
 
 
@@ -127,9 +121,5 @@ def test_options_follow_a_power_of_the_flux() -> None:
     np.testing.assert_allclose([each["window_fwhm_px"] for each in found], power, rtol=5e-3)
     assert [each[LOOP_GAIN] for each in found] == [each[LOOP_GAIN] for each in choices]
     assert smoothed(kind, stars[:2], choices[:2]) == choices[:2]
-
-
-def test_whole_numbers_are_not_smoothed() -> None:
-    stars = [small().replace("camera", photons_per_subaperture=flux) for flux in (20.0, 40.0, 80.0)]
-    choices = [{LOOP_GAIN: 0.1, "keep_brightest": kept} for kept in KEPT.values[:3]]
-    assert smoothed(BRIGHTEST, stars, choices) == choices
+    whole = [{LOOP_GAIN: 0.1, "keep_brightest": kept} for kept in KEPT.values[:3]]
+    assert smoothed(BRIGHTEST, stars[:3], whole) == whole  # numbers of pixels

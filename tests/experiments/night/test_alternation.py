@@ -15,21 +15,14 @@ TIME_S = np.linspace(0.0, 2.4 * 149, 150, dtype=np.float64)
 ONE = np.ones((150, 1))
 
 
-def test_without_drift_the_fit_is_ordinary_least_squares() -> None:
-    rng = np.random.default_rng(1)
-    design = np.column_stack([ONE, rng.standard_normal(150)])
-    values = design @ [1.0, 2.0] + rng.standard_normal(150)
-    expected = np.linalg.lstsq(design, values, rcond=None)[0]
-    np.testing.assert_allclose(coefficients(design, values, np.eye(150)), expected)
-
-
 def test_the_fit_is_that_of_whitened_values() -> None:
+    """Without drift, ordinary least squares."""
     rng = np.random.default_rng(2)
     design, values = rng.standard_normal((150, 3)), rng.standard_normal(150)
-    correlation = Drift(0.8, 30.0).correlation(TIME_S)
-    white = np.linalg.inv(np.linalg.cholesky(correlation))
-    expected = np.linalg.lstsq(white @ design, white @ values, rcond=None)[0]
-    np.testing.assert_allclose(coefficients(design, values, correlation), expected)
+    for correlation in (np.eye(150), Drift(0.8, 30.0).correlation(TIME_S)):
+        white = np.linalg.inv(np.linalg.cholesky(correlation))
+        expected = np.linalg.lstsq(white @ design, white @ values, rcond=None)[0]
+        np.testing.assert_allclose(coefficients(design, values, correlation), expected)
 
 
 def test_drift_and_noise_are_told_apart() -> None:
@@ -55,14 +48,11 @@ def test_values_are_predicted_from_all_other_groups() -> None:
 
 
 def test_jackknife_of_a_mean_is_its_standard_error() -> None:
+    """Fewer than three pieces have none."""
     values = np.random.default_rng(5).standard_normal(40)
     without = [float(np.delete(values, number).mean()) for number in range(40)]
     found = jackknife(float(values.mean()), without)
     assert found.standard_error == pytest.approx(values.std(ddof=1) / np.sqrt(40))
     assert found.high - found.value == pytest.approx(2.0227 * found.standard_error, rel=1e-4)  # t, 39
-
-
-def test_fewer_than_three_pieces_have_no_error() -> None:
     assert np.isnan(jackknife(1.0, [1.0, 2.0]).standard_error)
-    cycle = np.repeat([0, 1], 75)
-    assert np.isnan(coefficient(ONE, TIME_S, TIME_S, cycle, 0).standard_error)
+    assert np.isnan(coefficient(ONE, TIME_S, TIME_S, np.repeat([0, 1], 75), 0).standard_error)

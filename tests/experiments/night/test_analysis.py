@@ -3,8 +3,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from tests.experiments.night_cases import BLOCK_S, night_with, without_r0
 
+from faintspot.base.checks import not_none
 from faintspot.experiments.night.analysis import (
     ALL_STRENGTHS,
     BEST,
@@ -24,37 +26,33 @@ from faintspot.experiments.night.analysis import (
 
 
 def test_groups_leave_a_strength_of_zero_out() -> None:
+    """A method without a strength is a group of its own."""
     night = night_with()
     found = groups(night)
     assert list(found) == [ALL_STRENGTHS, BEST]
-    assert (night.strength[found[ALL_STRENGTHS]] > 0).all()
-    assert night.strength[found[BEST]].min() >= 0.6
-    assert night.strength[found[BEST]].max() <= 1.1
-    counted = found[ALL_STRENGTHS] | np.isnan(night.strength) | (night.strength == 0)
-    assert counted.all()
-
-
-def test_a_method_without_strength_is_a_group_of_its_own() -> None:
-    night = night_with()
-    labels = (*night.labels, "fixed window")
-    method = np.where(night.strength == 0, len(labels) - 1, night.method)
-    strength = np.where(night.strength == 0, np.nan, night.strength)
-    settings = (*night.settings, "")
-    changed = replace(night, labels=labels, settings=settings, method=method, strength=strength)
+    np.testing.assert_array_equal(found[ALL_STRENGTHS], night.strength > 0)
+    np.testing.assert_array_equal(found[BEST], (night.strength >= 0.6) & (night.strength <= 1.1))
+    labels, none = (*night.labels, "fixed window"), night.strength == 0
+    changed = replace(
+        night,
+        labels=labels,
+        settings=(*night.settings, ""),
+        method=np.where(none, len(labels) - 1, night.method),
+        strength=np.where(none, np.nan, night.strength),
+    )
     assert list(groups(changed)) == [ALL_STRENGTHS, BEST, "fixed window"]
 
 
-@pytest.mark.parametrize("effect", [0.12, -0.12])
-def test_a_known_effect_is_found_within_its_error(effect: float) -> None:
-    every, best = differences(night_with(1, effect=effect, best=-2 * effect))
-    for found, true in ((every, None), (best, -effect)):
-        assert found.paired is not None
-        if true is not None:
-            assert abs(found.measured.value - true) < 3 * found.measured.standard_error
-            assert abs(found.paired.value - true) < 3 * found.paired.standard_error
-        assert found.paired.standard_error < found.measured.standard_error
-        assert 0.003 < found.measured.standard_error < 0.05
-    assert best.measured.decided == -np.sign(effect)
+def test_a_known_effect_is_found_within_its_error() -> None:
+    for effect in (0.12, -0.12):
+        every, best = differences(night_with(1, effect=effect, best=-2 * effect))
+        for found in (every, best):
+            assert found.paired is not None
+            assert found.paired.standard_error < found.measured.standard_error
+            assert 0.003 < found.measured.standard_error < 0.05
+        for each in (best.measured, not_none(best.paired)):
+            assert abs(each.value + effect) < 3 * each.standard_error
+        assert best.measured.decided == -np.sign(effect)
 
 
 @pytest.mark.slow
@@ -84,27 +82,26 @@ def test_the_drift_follows_r0() -> None:
     assert drift_of_r0(without_r0(night)) is None
 
 
-def test_a_night_without_r0_is_compared_all_the_same() -> None:
+def test_what_is_not_known_is_left_out() -> None:
+    """Without r0 the night is compared all the same; without paired runs, hours are the measured effect's."""
     night = night_with(4, effect=0.1)
     found = differences(without_r0(night))[0]
     assert found.measured == found.without_r0
     assert abs(found.measured.value - 0.1) < 3.5 * found.measured.standard_error
     assert lines(without_r0(night)) == []
-
-
-def test_unknown_strehl_ratios_are_left_out() -> None:
-    night = night_with(5)
     strehl = night.strehl.copy()
     strehl[[0, 20]] = np.nan
     found = differences(replace(night, strehl=strehl))[0]
-    assert math.isfinite(found.measured.value)
     assert found.paired is not None
-    assert math.isfinite(found.paired.value)
+    assert math.isfinite(found.measured.value + found.paired.value)
+    found = differences(night_with(7, effect=0.1, paired=False))[0]
+    error = found.measured.standard_error
+    assert found.paired is None
+    assert found.hours_needed == pytest.approx(hours_needed(found.measured.value, error, found.hours))
 
 
-@pytest.mark.parametrize(
-    ("effect", "error", "hours", "shared", "needed"),
-    [
+def test_hours_are_those_of_three_standard_errors() -> None:
+    for effect, error, hours, shared, needed in (
         (0.03, 0.01, 2.0, 0.0, 2.0),
         (-0.01, 0.01, 2.0, 0.0, 18.0),
         (0.0, 0.01, 2.0, 0.0, math.inf),
@@ -112,18 +109,10 @@ def test_unknown_strehl_ratios_are_left_out() -> None:
         (0.03, 0.02, 1.0, 0.0, 4.0),
         (0.03, math.hypot(0.02, 0.006), 1.0, 0.006, 6.25),
         (0.03, 0.02, 1.0, 0.01, math.inf),
-    ],
-)
-def test_hours_are_those_of_three_standard_errors(
-    effect: float, error: float, hours: float, shared: float, needed: float
-) -> None:
-    assert hours_needed(effect, error, hours, shared) == pytest.approx(needed, nan_ok=True)
-
-
-def test_a_night_is_long_enough_for_a_large_effect() -> None:
-    seen, unseen = (differences(night_with(6, effect=effect))[0] for effect in (0.3, 0.005))
-    assert seen.is_long_enough
-    assert not unseen.is_long_enough
+    ):
+        assert hours_needed(effect, error, hours, shared) == pytest.approx(needed, nan_ok=True)
+    for effect, enough in ((0.3, True), (0.005, False)):
+        assert differences(night_with(6, effect=effect))[0].is_long_enough == enough
 
 
 def test_hours_of_a_group_are_those_of_its_blocks_and_of_the_reference() -> None:
@@ -148,15 +137,6 @@ def test_means_of_sets_and_a_parabola_of_the_seeing_are_removed_exactly() -> Non
     assert abs(contrast(known, known.strength > 0, reference, None).value - 0.07) > 1e-4
 
 
-def test_without_paired_runs_hours_are_those_of_the_measured_effect() -> None:
-    found = differences(night_with(7, effect=0.1, paired=False))[0]
-    assert found.paired is None
-    measured = found.measured
-    assert found.hours_needed == pytest.approx(
-        hours_needed(measured.value, measured.standard_error, found.hours)
-    )
-
-
 def test_ranges_of_strengths_hold_every_strength_once() -> None:
     """One on an edge belongs to the paper's range, else to the lower range."""
     night = night_with(8, best=0.2)
@@ -172,20 +152,19 @@ def test_ranges_of_strengths_hold_every_strength_once() -> None:
 
 
 def test_the_line_against_r0_is_least_squares() -> None:
+    """Its error is that of a jackknife over cycles."""
     night = night_with(9)
-    line = lines(night)[0]
-    rows = night.method == night.reference
-    slope, intercept = np.polyfit(night.r0_m[rows], night.strehl[rows], 1)
-    assert (line.slope_per_m.value, line.intercept) == pytest.approx((slope, intercept))
+    line, rows = lines(night)[0], night.method == night.reference
+
+    def fitted(rows: NDArray[np.bool_]) -> NDArray[np.float64]:
+        return np.polyfit(night.r0_m[rows], night.strehl[rows], 1)
+
+    assert (line.slope_per_m.value, line.intercept) == pytest.approx(fitted(rows))
     assert line.correlation == pytest.approx(np.corrcoef(night.r0_m[rows], night.strehl[rows])[0, 1])
     assert line.slope_per_m.decided == 1
-    per_cm = (line.slope_per_cm.value, line.slope_per_cm.standard_error, line.slope_per_cm.high)
-    per_m = (line.slope_per_m.value, line.slope_per_m.standard_error, line.slope_per_m.high)
-    assert per_cm == pytest.approx([0.01 * number for number in per_m])
-    without = [
-        np.polyfit(night.r0_m[rows & (night.cycle != each)], night.strehl[rows & (night.cycle != each)], 1)[0]
-        for each in range(12)
-    ]
+    for name in ("value", "standard_error", "high"):
+        assert getattr(line.slope_per_cm, name) == pytest.approx(0.01 * getattr(line.slope_per_m, name))
+    without = [fitted(rows & (night.cycle != each))[0] for each in range(12)]
     error = np.sqrt(11 / 12 * np.square(without - np.mean(without)).sum())
     assert line.slope_per_m.standard_error == pytest.approx(error)
 
@@ -202,16 +181,15 @@ def test_means_of_sets_and_of_all() -> None:
 
 def test_a_shared_error_widens_intervals_and_does_not_fall_with_time() -> None:
     night = night_with(effect=0.05)
-    before = differences(night)[0]
     shared = np.where(night.method == night.reference, 0.0, 0.01)
-    after = differences(replace(night, shared_error=shared))[0]
-    assert after.measured.value == before.measured.value
-    assert after.measured.standard_error == pytest.approx(math.hypot(before.measured.standard_error, 0.01))
-    assert after.measured.high - after.measured.value == pytest.approx(
-        math.hypot(before.measured.high - before.measured.value, 1.96 * 0.01)
+    before, after, too_much = (
+        differences(replace(night, shared_error=factor * shared))[0] for factor in (0, 1, 3)
     )
+    one, other = before.measured, after.measured
+    assert other.value == one.value
+    assert other.standard_error == pytest.approx(math.hypot(one.standard_error, 0.01))
+    assert other.high - other.value == pytest.approx(math.hypot(one.high - one.value, 1.96 * 0.01))
     assert after.hours_needed > before.hours_needed
-    too_much = differences(replace(night, shared_error=3 * shared))[0]
     assert too_much.shared_error == pytest.approx(0.03)
 
 
@@ -220,19 +198,19 @@ def outcomes(*arguments: int, **options: float) -> list[tuple[str, str]]:
     return [(each.outcome, each.paired_outcome) for each in found]
 
 
-def test_a_night_that_confirms_the_paper() -> None:
+def test_verdicts_follow_the_effect() -> None:
+    """A small one is not decided by alternation but by the same turbulence."""
     assert outcomes(1, effect=0.2, best=0.2) == [(HOLDS, HOLDS)] * 3 + [(HOLDS, "")]
-
-
-def test_a_night_that_contradicts_it() -> None:
     assert outcomes(1, effect=-0.2, best=-0.2)[:3] == [(FAILS, FAILS)] * 3
-
-
-def test_a_small_effect_is_not_decided_by_alternation_but_by_the_same_turbulence() -> None:
     (every, *_) = verdicts(night_with(0, effect=-0.02))
     assert (every.outcome, every.paired_outcome) == (OPEN, FAILS)
     assert abs(every.significance) < 3
     assert every.hours_needed > 2 * night_with(0).hours
+    unpaired = outcomes(3, effect=0.2, paired=False)
+    assert {paired for _, paired in unpaired} == {""}
+    assert unpaired[0][0] == HOLDS
+    night = night_with(4)
+    assert verdicts(replace(night, strength=np.full(len(night.strehl), np.nan))) == []
 
 
 def test_best_strengths_are_compared_with_all_others() -> None:
@@ -250,14 +228,3 @@ def test_best_strengths_are_compared_with_all_others() -> None:
     needed = 68 * BLOCK_S / 3600 * (3 * slope.standard_error / slope.value) ** 2
     assert line.hours_needed == pytest.approx(needed)
     assert line.unit == " per cm"
-
-
-def test_without_paired_runs_there_is_no_paired_verdict() -> None:
-    found = verdicts(night_with(3, effect=0.2, paired=False))
-    assert {each.paired_outcome for each in found} == {""}
-    assert found[0].outcome == HOLDS
-
-
-def test_a_night_without_strengths_has_no_verdicts() -> None:
-    night = night_with(4)
-    assert verdicts(replace(night, strength=np.full(len(night.strehl), np.nan))) == []

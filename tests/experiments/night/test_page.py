@@ -42,15 +42,11 @@ def test_summary_and_page(tmp_path: Path) -> None:
 
 def test_what_is_not_known_is_null() -> None:
     night = without_r0(night_with(2, paired=False))
-    night = replace(night, true_r0_m=night.r0_m)
-    summary = night_summary(night)
+    summary = night_summary(replace(night, true_r0_m=night.r0_m))
     json.dumps(summary, allow_nan=False)
     assert summary["against_r0"] == []
     assert summary["differences"][0]["paired"] is None
-
-
-def test_the_text_has_a_line_for_each_verdict_and_difference() -> None:
     lines = night_summary_text(night_with(3)).splitlines()
-    assert len(lines) == 4 + 4 + 2
+    assert len(lines) == 4 + 4 + 2  # verdicts, means and differences
     assert all(" σ" in line for line in lines[:4] + lines[8:])
     assert all("alternating" in line for line in lines[8:])

@@ -21,23 +21,22 @@ from faintspot.experiments.night.protocol import Night, NightPlan
 PAPER_PLAN = NightPlan(gap_frames=0)
 
 
-def test_exposures_of_the_protocol() -> None:
-    """8 strengths from 0 to 2: 7 above 0 and one in 0.6 to 1.1; of 20, 19 and five. All twice."""
-    np.testing.assert_array_equal(paper_exposures(), [[2, 14, 2], [2, 38, 10]] * 2)
-
-
 def test_differences_of_table_1_by_hand() -> None:
-    every, best = set_differences(PAPER_MEANS, PAPER_SCATTERS, paper_exposures())
-    np.testing.assert_allclose([each.value for each in every], [0.004, 0.002, 0.005, 0.004], atol=1e-12)
-    np.testing.assert_allclose([each.value for each in best], [0.016, 0.011, 0.011, 0.010], atol=1e-12)
+    """8 strengths from 0 to 2: 7 above 0 and one in 0.6 to 1.1; of 20, 19 and five. All twice."""
+    exposures = paper_exposures()
+    np.testing.assert_array_equal(exposures, [[2, 14, 2], [2, 38, 10]] * 2)
     # Pooled by hand: without TV (0.1, 1.2, 1.5, 1.6 %) one degree of freedom a set.
     none = math.sqrt((0.1**2 + 1.2**2 + 1.5**2 + 1.6**2) / 4)
     tv = math.sqrt((13 * 1.8**2 + 37 * 1.3**2 + 13 * 1.1**2 + 37 * 1.8**2) / 100)
     ranged = math.sqrt((1.6**2 + 9 * 2.0**2 + 0.4**2 + 9 * 1.2**2) / 20)
-    for each, counts in zip(every, (14, 38, 14, 38), strict=True):
-        assert each.standard_error == pytest.approx(0.01 * math.hypot(none / 2**0.5, tv / counts**0.5))
-    for each, counts in zip(best, (2, 10, 2, 10), strict=True):
-        assert each.standard_error == pytest.approx(0.01 * math.hypot(none / 2**0.5, ranged / counts**0.5))
+    every, best = set_differences(PAPER_MEANS, PAPER_SCATTERS, exposures)
+    for found, values, scatter, counts in (
+        (every, [0.004, 0.002, 0.005, 0.004], tv, exposures[:, 1]),
+        (best, [0.016, 0.011, 0.011, 0.010], ranged, exposures[:, 2]),
+    ):
+        assert [each.value for each in found] == pytest.approx(values, abs=1e-12)
+        errors = 0.01 * np.hypot(none / 2**0.5, scatter / np.sqrt(counts))
+        assert [each.standard_error for each in found] == pytest.approx(errors)
 
 
 def test_chi_square_by_hand() -> None:
@@ -65,19 +64,13 @@ def test_chances_are_those_of_normal_scatter() -> None:
     errors = [scatter * math.sqrt((1 / counts[:, column] + 1 / counts[:, 0]).sum()) / 4 for column in (1, 2)]
     every, best, any_range = chances_without_difference(night, errors)  # one standard error each
     # The scatter of 120 blocks is known to 7 %, which moves the share by 0.017.
-    assert every == pytest.approx(0.159, abs=3 * math.hypot(0.012, 0.017))
-    assert best == pytest.approx(0.159, abs=3 * math.hypot(0.012, 0.017))
+    assert [every, best] == pytest.approx([0.159] * 2, abs=3 * math.hypot(0.012, 0.017))
     assert any_range > best
-    certain = chances_without_difference(night, [-1.0, -1.0])
-    assert certain == (1.0, 1.0, 1.0)
-    assert chances_without_difference(night, [1.0, 1.0]) == (0.0, 0.0, 0.0)
-
-
-def test_scatter_below_the_papers_is_raised_to_it() -> None:
-    counts = paper_exposures()[:, :2]
-    pooled = math.sqrt(((counts - 1) * PAPER_SCATTERS[:, :2] ** 2).sum() / (counts - 1).sum())
-    error = pooled * math.sqrt((1 / counts[:, 1] + 1 / counts[:, 0]).sum()) / 4
-    share = chances_without_difference(steady(1e-4), [error, 1.0])[0]
+    for least, chance in ((-1.0, 1.0), (1.0, 0.0)):
+        assert chances_without_difference(night, [least] * 2) == (chance, chance, chance)
+    # Scatter below the paper's is raised to it.
+    pooled = math.sqrt(((counts[:, :2] - 1) * PAPER_SCATTERS[:, :2] ** 2).sum() / (counts[:, :2] - 1).sum())
+    share = chances_without_difference(steady(1e-4), [pooled / scatter * errors[0], 1.0])[0]
     assert share == pytest.approx(0.159, abs=3 * 0.012)
 
 
@@ -101,6 +94,9 @@ def test_synthetic_nights_scatter_as_the_papers_and_drift_by_its_share() -> None
 def test_a_night_beside_the_paper() -> None:
     """Differences of the synthetic night are 0.02; scatter by chance allows it 4 standard errors."""
     night = night_with(1, plan=PAPER_PLAN)
+    assert compare_with_paper(replace(night, strength=np.full(len(night.strehl), np.nan))) is None
+    one_set = replace(night, set_names=night.set_names[:1], set_number=0 * night.set_number)
+    assert compare_with_paper(one_set) is None
     night = replace(night, strehl=steady(0.012, 3).strehl + np.where(night.strength > 0, 0.02, 0.0))
     compared = compare_with_paper(night)
     assert compared is not None
@@ -118,10 +114,3 @@ def test_a_night_beside_the_paper() -> None:
     none, tv = (night.strehl[rows & (night.set_number == 2)].mean() for rows in
                 (night.method == 0, night.strength > 0))  # fmt: skip
     assert every.ours[2].value == pytest.approx(tv - none)
-
-
-def test_other_nights_have_no_paper_to_compare_with() -> None:
-    night = steady(0.01)
-    assert compare_with_paper(replace(night, strength=np.full(len(night.strehl), np.nan))) is None
-    whole = replace(night, set_names=night.set_names[:1], set_number=0 * night.set_number)
-    assert compare_with_paper(whole) is None

@@ -1,4 +1,5 @@
 from dataclasses import fields, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -6,7 +7,7 @@ import numpy as np
 import pytest
 from tests.experiments.experiment_cases import small
 from tests.experiments.night_cases import night_with
-from tests.refusals import refused
+from tests.refusals import assert_each_refused, refused
 
 from faintspot.experiments.night.protocol import (
     COUNTS,
@@ -38,6 +39,7 @@ def test_each_cycle_begins_without_tv_and_strengths_rise() -> None:
 
 
 def test_sets_follow_one_another() -> None:
+    """The night is the paper's: sets with 8 or 20 strengths, repeated: a little more than an hour."""
     for plan in (NightPlan(), QUICK_PLAN):
         firsts = np.concatenate([plan.first_frames(number) for number in range(plan.sets)])
         np.testing.assert_array_equal(firsts, 4650 * np.arange(len(firsts)))  # 31 s at 150 frames/s
@@ -45,15 +47,15 @@ def test_sets_follow_one_another() -> None:
         assert len(numbers) == plan.frames(1) == len(plan.schedule(1))
         np.testing.assert_array_equal(numbers[:: plan.block_frames], plan.first_frames(1))
         assert numbers[plan.block_frames - 1] == plan.first_frames(1)[0] + plan.block_frames - 1
-
-
-def test_the_night_is_the_papers() -> None:
-    """Each set without TV and with 8 or 20 strengths, and that repeated: a little more than an hour."""
-    plan, rate_hz = NightPlan(), load_loop("canary").control.frame_rate_hz
+    plan, loop = NightPlan(), load_loop("canary")
     assert [plan.blocks(number) for number in range(4)] == [18, 42, 18, 42]
-    blocks = sum(plan.blocks(number) for number in range(4))
-    hours = blocks * (plan.block_frames + plan.gap_frames) / rate_hz / 3600
+    hours = 120 * (plan.block_frames + plan.gap_frames) / loop.control.frame_rate_hz / 3600
     assert 1 < hours < 1.1
+    # 500 to 1,000 counts, with the full multiplication gain and with 75 % of it.
+    signals = [loop.photons * counts_per_e(plan.configuration(loop, number)) for number in range(4)]
+    np.testing.assert_allclose(signals, [750, 750, 562.5, 562.5])
+    # Without multiplication there is nothing to lower.
+    assert [plan.configuration(small(), number).camera.em_gain for number in (0, 3)] == [1, 1]
 
 
 def test_strengths_in_counts_follow_the_multiplication_gain() -> None:
@@ -68,21 +70,6 @@ def test_strengths_in_counts_follow_the_multiplication_gain() -> None:
         assert [method.label for method in tv] == ["TV 0.6 counts", "TV 1.5 counts"]
 
 
-def test_the_preset_has_the_papers_signal() -> None:
-    """500 to 1,000 counts, with the full gain and with 75 % of it."""
-    loop, plan = load_loop("canary"), NightPlan()
-    signals = [loop.photons * counts_per_e(plan.configuration(loop, number)) for number in range(4)]
-    np.testing.assert_allclose(signals, [750, 750, 562.5, 562.5])
-
-
-def test_multiplication_gain_is_full_and_then_three_quarters() -> None:
-    loop = small().replace("camera", em_gain=400.0)
-    gains = [NightPlan().configuration(loop, number).camera.em_gain for number in range(4)]
-    assert gains == [400, 400, 300, 300]
-    plain = NightPlan().configuration(small(), 3)
-    assert plain.camera.em_gain == 1  # without multiplication there is nothing to lower
-
-
 def test_methods_share_pixels_and_loop_gain() -> None:
     none, *tv = NightPlan(keep_brightest=30).made(small(), 0)
     assert isinstance(none.estimator, BrightestPixels)
@@ -91,40 +78,37 @@ def test_methods_share_pixels_and_loop_gain() -> None:
     assert {(method.gain, method.corrects_gain) for method in (none, *tv)} == {(None, False)}
     assert all(isinstance(method.estimator, TotalVariation) for method in tv)
     assert [method.estimator.noise_std for method in tv][-1] == 2  # type: ignore[attr-defined]
-
-
-def test_other_methods_are_one_block_of_a_cycle() -> None:
     plan = NightPlan(methods=("window", "none", "tv"), listed_strengths=(0.4, 0.8))
     assert [name for name, _ in plan.entries(0)] == ["window", "none", "tv", "tv"]
     labels = [method.label for method in plan.made(small(), 0)]
     assert labels == ["fixed window", "no TV", "TV 0.4 e-", "TV 0.8 e-"]
 
 
-PLAN, NIGHT = NightPlan(), night_with()
-
-
-@pytest.mark.parametrize(
-    ("record", "changes", "words"),
-    [
-        (PLAN, {"block_frames": 90}, "plan.block_frames = 90"),
-        (PLAN, {"repeats": (1, 1)}, "for each set"),
-        (PLAN, {"methods": ("none",)}, "two or more"),
-        (PLAN, {"methods": ("none", "none")}, "two or more"),
-        (PLAN, {"methods": ("none", "map+kalman")}, "expected the integrator"),
-        (PLAN, {"methods": ("none", "nothing")}, "nothing"),
-        (PLAN, {"listed_strengths": (-1.0,)}, "strengths"),
-        (PLAN, {"strengths": (1, 8, 8, 8)}, "plan.strengths = 1"),
-        (PLAN, {"em_fractions": (0.0, 1.0, 1.0, 1.0)}, "plan.em_fractions = 0"),
-        (NIGHT, {"strehl": np.zeros(3)}, "strehl: expected a value for each"),
-        (NIGHT, {"reference": 99}, "reference: expected 0 to"),
-        (NIGHT, {"labels": ("one",)}, "method: expected numbers from 0 to 0"),
-        (NIGHT, {"set_names": ("one",)}, "set_number: expected numbers from 0 to 0"),
-    ],
-    ids=lambda value: value if isinstance(value, str) else "",
-)
-def test_what_does_not_fit_is_refused(record: Any, changes: dict[str, object], words: str) -> None:
-    with refused(words):
-        replace(record, **changes)
+def test_what_does_not_fit_is_refused(tmp_path: Path) -> None:
+    assert_each_refused(
+        partial(replace, NightPlan()),
+        block_frames=[90],
+        repeats=[(1, 1)],
+        methods=[("none",), ("none", "none")],
+    )
+    for changes, words in (
+        ({"methods": ("none", "map+kalman")}, "integrator"),
+        ({"methods": ("none", "nothing")}, "nothing"),
+        ({"listed_strengths": (-1.0,)}, "strengths"),
+        ({"strengths": (1, 8, 8, 8)}, "plan.strengths = 1"),
+        ({"em_fractions": (0.0, 1.0, 1.0, 1.0)}, "plan.em_fractions = 0"),
+    ):
+        wrong: Any = changes
+        with refused(words):
+            NightPlan(**wrong)
+    assert_each_refused(partial(replace, night_with()), strehl=[np.zeros(3)], reference=[99])
+    for name, word in (("labels", "method"), ("set_names", "set_number")):
+        names: Any = {name: ("one",)}
+        with refused(word):
+            replace(night_with(), **names)
+    np.savez(tmp_path / "other.npz", strehl=np.zeros(3))
+    with refused("format 2"):
+        Night.load(tmp_path / "other.npz")
 
 
 def test_a_night_is_read_as_it_was_written(tmp_path: Path) -> None:
@@ -141,12 +125,6 @@ def test_a_night_is_read_as_it_was_written(tmp_path: Path) -> None:
             assert after == before
 
 
-def test_anything_else_is_refused(tmp_path: Path) -> None:
-    np.savez(tmp_path / "other.npz", strehl=np.zeros(3))
-    with refused("expected a night of format 2"):
-        Night.load(tmp_path / "other.npz")
-
-
 def test_cycles_begin_with_the_reference_and_with_sets() -> None:
     night = night_with()
     rows = np.flatnonzero(night.set_number < 2)
@@ -156,8 +134,4 @@ def test_cycles_begin_with_the_reference_and_with_sets() -> None:
     assert (night.method[rows][first] == night.reference).all()
     moved = replace(night, method=np.where(np.arange(len(night.strehl)) == 0, 1, night.method))
     assert moved.cycle[0] == 0  # a set that does not begin with the reference
-
-
-def test_hours_include_settling() -> None:
-    night = night_with()
-    assert night.hours == pytest.approx(len(night.strehl) * 2.4 / 3600)
+    assert night.hours == pytest.approx(len(night.strehl) * 2.4 / 3600)  # with settling

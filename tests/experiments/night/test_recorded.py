@@ -21,15 +21,9 @@ from tests.loop.telemetry.alternation_cases import (
 from tests.refusals import refused
 
 from faintspot.base.report.page import Table
+from faintspot.experiments.night import recorded as from_recording
 from faintspot.experiments.night.analysis import differences
-from faintspot.experiments.night.recorded import (
-    alternates,
-    page_of_recording,
-    phase_differences,
-    recorded_night,
-    summary_of_recording,
-    text_of_recording,
-)
+from faintspot.experiments.night.recorded import recorded_night, text_of_recording
 from faintspot.experiments.night.recorded_methods import MeasuredStrehl, read_strehl
 from faintspot.loop.control.options import ControlOptions
 from faintspot.slopes.sensor.layout import Layout
@@ -42,18 +36,11 @@ SETTLE = DELAY + 8  # and 3 / 0.4 frames, rounded up
 METHODS = ("none", "tv:0.6")
 
 
-def stored(
-    folder: Path,
-    known: KnownLoop,
-    methods: tuple[str, ...] = METHODS,
-    layout: Layout = LAYOUT,
-    **options: Any,
-) -> Path:
-    loop = known.loop
-    return write_recording(
-        folder / "night.zarr", layout, loop.slopes, loop.commands, loop.method, methods, MATRIX,
-        rate_hz=RATE_HZ, options=OPTIONS, **options,
-    )  # fmt: skip
+def stored(folder: Path, known: KnownLoop, methods: tuple[str, ...] = METHODS, **options: Any) -> Path:
+    folder.mkdir(exist_ok=True)
+    loop, path, layout = known.loop, folder / "night.zarr", options.pop("layout", LAYOUT)
+    measured = loop.slopes, loop.commands, loop.method, methods
+    return write_recording(path, layout, *measured, MATRIX, rate_hz=RATE_HZ, options=OPTIONS, **options)
 
 
 def drifting_strehl(frames: int, effect: float, seed: int) -> MeasuredStrehl:
@@ -75,7 +62,7 @@ def drifting_strehl(frames: int, effect: float, seed: int) -> MeasuredStrehl:
 def test_the_difference_of_residual_phase_is_found(tmp_path: Path) -> None:
     known = alternating(4000, noise_px=(0.15, 0.05))
     path = stored(tmp_path, known, ("integrator", "set+integrator"))
-    assert alternates(path)
+    assert from_recording.alternates(path)
     recorded = recorded_night(path)
     night = recorded.night
     assert night.labels == ("integrator", "set+integrator")
@@ -86,7 +73,7 @@ def test_the_difference_of_residual_phase_is_found(tmp_path: Path) -> None:
     scored = np.arange(4000) % 50 >= SETTLE
     wave = (2 * np.pi / night.wavelength_m) ** 2
     true = [wave * known.phase_m2[scored & (known.loop.method == method)].mean() for method in (0, 1)]
-    (found,) = phase_differences(recorded)
+    (found,) = from_recording.phase_differences(recorded)
     assert found.measured.low < true[1] - true[0] < found.measured.high < 0
     # Not only in difference; fitting and aliasing, which slopes do not show, are added.
     unseen = 0.36 * (SUBAPERTURE_M / night.r0_m) ** (5 / 3) * (500e-9 / night.wavelength_m) ** 2
@@ -105,7 +92,7 @@ def test_the_difference_of_residual_phase_is_found(tmp_path: Path) -> None:
     middle_s = np.arange(2) * 50 / RATE_HZ + ((together - 1) * 50 + 0.5 * (SETTLE + 49)) / RATE_HZ
     np.testing.assert_allclose(night.middle_s[:2], middle_s - SETTLE / RATE_HZ, atol=1e-6)
     np.testing.assert_array_equal(night.r0_m[::2], night.r0_m[1::2])  # of all methods together
-    summary = summary_of_recording(recorded)
+    summary = from_recording.summary_of_recording(recorded)
     json.dumps(summary, allow_nan=False)
     assert summary["settle_frames"] == {"integrator": SETTLE, "set+integrator": SETTLE}
     assert "estimated from slopes" in text_of_recording(recorded)
@@ -191,7 +178,7 @@ def test_slopes_that_lean_on_a_prediction(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_page_of_a_night_lists_its_blocks(tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
-    page = page_of_recording(recorded_night(stored(tmp_path, alternating(3000))))
+    page = from_recording.page_of_recording(recorded_night(stored(tmp_path, alternating(3000))))
     assert [section.name for section in page.sections][-2:] == ["phase", "blocks"]
     blocks = page.sections[-1]
     assert "60 turns" in str(blocks.parts)
@@ -209,9 +196,7 @@ def test_what_cannot_be_compared(tmp_path: Path) -> None:
     wrong_times = MeasuredStrehl(np.arange(9.0), np.full(9, 0.3), np.zeros(9))
     with refused("no exposure lies within", "Unix times"):
         recorded_night(path, strehl=wrong_times)
-    (tmp_path / "open").mkdir()
-    assert not alternates(stored(tmp_path / "open", known, loop=1))
-    (tmp_path / "unknown").mkdir()
+    assert not from_recording.alternates(stored(tmp_path / "open", known, loop=1))
     unknown = stored(tmp_path / "unknown", known, layout=Layout.grid((SIDE, SIDE), pixels=8))
     with refused("subaperture_m or diameter_m: unknown", "--system"):
         recorded_night(unknown)

@@ -1,5 +1,6 @@
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,22 +17,23 @@ from faintspot.loop.simulation.record import slope_turbulence
 skip_without("hcipy")
 pytest.importorskip("zarr")
 
-PLAN = NightPlan(
-    block_frames=60,
-    settle_in_block=20,
-    gap_frames=0,
-    strengths=(2, 3),
-    em_fractions=(1.0, 0.75),
-    repeats=(2, 1),
-    strongest=1.0,
-    keep_brightest=12,
-)
+SETS: dict[str, Any] = {"strengths": (2, 3), "em_fractions": (1.0, 0.75), "repeats": (2, 1)}
+PLAN = NightPlan(block_frames=60, settle_in_block=20, gap_frames=0, strongest=1.0, keep_brightest=12, **SETS)
 LOOP = small().replace("atmosphere", r0_m=(0.1, 0.2), drift_time_s=2.0).replace("camera", em_gain=100.0)
 
 
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return the folder of a night that was not interrupted."""
+    folder = tmp_path_factory.mktemp("night")
+    night = run_night(LOOP, folder, plan=PLAN, pool=HERE)
+    np.testing.assert_array_equal(Night.load(folder / "night.npz").strehl, night.strehl)
+    return folder
+
+
 @pytest.mark.slow
-def test_a_night_is_what_the_loop_does(tmp_path: Path) -> None:
-    night = run_night(LOOP, tmp_path, plan=PLAN, pool=HERE)
+def test_a_night_is_what_the_loop_does(whole: Path) -> None:
+    night = Night.load(whole / "night.npz")
     assert len(night.strehl) == 2 * 3 + 4
     assert night.labels == ("no TV", "TV 0 e-", "TV 1 e-", "TV 0.5 e-")
     np.testing.assert_array_equal(night.method, [0, 1, 2, 0, 1, 2, 0, 1, 3, 2])
@@ -69,20 +71,17 @@ def test_a_night_is_what_the_loop_does(tmp_path: Path) -> None:
     assert ((night.r0_m > 0.3 * night.true_r0_m) & (night.r0_m < 3 * night.true_r0_m))[
         np.isfinite(night.r0_m)
     ].all()
-    np.testing.assert_array_equal(Night.load(tmp_path / "night.npz").strehl, night.strehl)
 
 
 @pytest.mark.slow
-def test_an_interrupted_night_goes_on(tmp_path: Path) -> None:
-    whole, interrupted = tmp_path / "whole", tmp_path / "interrupted"
-    run_night(LOOP, whole, plan=PLAN, pool=HERE)
+def test_an_interrupted_night_goes_on(tmp_path: Path, whole: Path) -> None:
     with pytest.raises(KeyboardInterrupt):
-        run_night(LOOP, interrupted, plan=PLAN, pool=WorkerPool(0, StopsAfter(500)))
-    assert not (interrupted / "night.zarr").exists()
-    run_night(LOOP, interrupted, plan=PLAN, pool=HERE)
-    assert_same_files(whole, interrupted)
+        run_night(LOOP, tmp_path, plan=PLAN, pool=WorkerPool(0, StopsAfter(500)))
+    assert not (tmp_path / "night.zarr").exists()
+    run_night(LOOP, tmp_path, plan=PLAN, pool=HERE)
+    assert_same_files(whole, tmp_path)
     with refused("--overwrite"):
-        run_night(LOOP, interrupted, plan=replace(PLAN, keep_brightest=9), pool=HERE)
+        run_night(LOOP, tmp_path, plan=replace(PLAN, keep_brightest=9), pool=HERE)
 
 
 @pytest.mark.slow

@@ -24,15 +24,9 @@ def equal(cell: Any, method: str, mode: str) -> float:
 
 
 def study(**options: Any) -> Any:
-    every = [
-        *cells(),
-        *cells(size=2.0),
-        *cells(read_noise_e=3.0),
-        *cells(position_range_px=4.0),
-        *cells(profile="gaussian"),
-        *cells(pixels=8),
-    ]
-    return dataset(every, power_law(equal), **options)
+    others: list[dict[str, Any]] = [{}, {"size": 2.0}, {"read_noise_e": 3.0}, {"position_range_px": 4.0}]
+    others += [{"profile": "gaussian"}, {"pixels": 8}]
+    return dataset([cell for each in others for cell in cells(**each)], power_law(equal), **options)
 
 
 def test_sweep_is_drawn_in_both_modes_and_one_row_for_each_profile_and_range() -> None:
@@ -49,26 +43,19 @@ def test_sweep_is_drawn_in_both_modes_and_one_row_for_each_profile_and_range() -
 
 
 def test_solid_is_tv_and_dashed_is_not() -> None:
+    """The numbers of a sweep are in its data; the axis is what varies when the flux does not."""
     data = study()
-    figure = sweep_figure(data, list(range(5)), "fig9", "A title").figure
-    lines = [line for line in figure.axes[0].lines if np.size(line.get_xdata()) == 5]
+    made = sweep_figure(data, list(range(5)), "fig9", "A title")
+    lines = [line for line in made.figure.axes[0].lines if np.size(line.get_xdata()) == 5]
     assert [line.get_linestyle() for line in lines] == ["-", "--"]
     for line, method in zip(lines, ("tv", "brightest"), strict=True):
         wanted = data["error"].sel(estimator=method, mode="best").values[:5]
         np.testing.assert_allclose(np.asarray(line.get_ydata(), dtype=float), wanted)
-
-
-def test_numbers_of_a_sweep_are_in_its_data() -> None:
-    data = study()
-    made = sweep_figure(data, [0, 1], "fig9", "A title")
     rows = list(csv.DictReader(io.StringIO(made.csv)))
-    assert len(rows) == 2 * 2 * 2  # cells, methods and the modes that are drawn
+    assert len(rows) == 5 * 2 * 2  # cells, methods and the modes that are drawn
     row = next(row for row in rows if row["panel"].startswith("fixed") and row["line"] == label_of("tv"))
     wanted = data["error"].isel(cell=0).sel(mode="fixed40", estimator="tv")
     assert [float(row[name]) for name in "xy"] == pytest.approx([10.0, float(wanted)], rel=1e-6)
-
-
-def test_axis_is_what_varies_when_the_flux_does_not() -> None:
     every = [cell for noise in (0.1, 1.0, 3.0) for cell in cells(fluxes=(100.0,), read_noise_e=noise)]
     figure = sweep_figure(dataset(every, power_law(equal)), [0, 1, 2], "noise", "Read noise").figure
     assert figure.axes[0].get_xlabel() == "read noise (e-)"
@@ -104,24 +91,17 @@ def test_spread_is_that_of_the_curve() -> None:
 
 
 def test_baselines_are_drawn_for_the_main_read_noises() -> None:
-    made = baselines_figure(study(), "diffraction")
+    part = study(unfinished=range(5, 30))
+    made, unfinished = (baselines_figure(each, "diffraction") for each in (study(), part))
     assert made is not None
+    assert unfinished is not None
     assert [axes.get_title() for axes in made.figure.axes] == [
-        "best k: 0.1 e- read noise",
-        "fixed k = 40: 0.1 e- read noise",
-        "best k: 3 e- read noise",
-        "fixed k = 40: 3 e- read noise",
+        f"{mode}: {noise} e- read noise" for noise in (0.1, 3) for mode in ("best k", "fixed k = 40")
     ]
     assert len(made.figure.axes[0].containers) == len(METHODS)
+    assert len(unfinished.figure.axes) == 2
     assert baselines_figure(study(), "nothing") is None
-
-
-def test_unfinished_cells_are_not_drawn() -> None:
-    data = study(unfinished=tuple(range(5, 30)))
-    made = baselines_figure(data, "diffraction")
-    assert made is not None
-    assert len(made.figure.axes) == 2
-    assert baselines_figure(data, "gaussian") is None
+    assert baselines_figure(part, "gaussian") is None
 
 
 def test_triple_picture_shows_noise_and_its_removal() -> None:

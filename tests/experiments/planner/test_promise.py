@@ -85,12 +85,9 @@ def test_errors_decide_what_contradicts() -> None:
 
 def test_scatter_between_frames_that_one_method_alone_has_is_its_error() -> None:
     def checked(scatters: dict[str, float]) -> dict[str, Promise]:
-        alike = Estimate(0.1, 0.001)
+        alike, known = Estimate(0.1, 0.001), {name: Estimate(s, 0.002) for name, s in scatters.items()}
         return _with_unshared(
-            {
-                name: Promise(100.0, alike, alike, Estimate(s, 0.002), 1.0, 0.07)
-                for name, s in scatters.items()
-            }
+            {name: Promise(100.0, alike, alike, scatter, 1.0, 0.07) for name, scatter in known.items()}
         )
 
     still = checked({"window": 0.11, "smoothed": 0.115, "ml": 0.3})
@@ -116,13 +113,8 @@ def test_spots_in_the_middle_of_the_search_range_have_larger_errors_than_spread_
     rng = np.random.default_rng(7)
     camera = Detector(read_noise_e=3.0, offset_adu=100.0)
     frames, truth = sensor_frames(LAYOUT, 80, flux_e=36.0, position_range_px=0.01, detector=camera, rng=rng)
-    known: dict[str, Any] = {
-        "gain_e_per_adu": 1.0,
-        "read_noise_e": 3.0,
-        "fwhm_px": 1.77,
-        "search_range_px": 1.0,
-    }
-    question = question_from_frames(frames[:40], layout=LAYOUT, **known)
+    known: dict[str, Any] = {"gain_e_per_adu": 1.0, "read_noise_e": 3.0, "fwhm_px": 1.77}
+    question = question_from_frames(frames[:40], layout=LAYOUT, search_range_px=1.0, **known)
     answer = tune(question, **QUICK)
     promise, method = answer.promises["ml"], answer["ml"].method
     assert promise.placed_px > 1.05 * promise.promised_px

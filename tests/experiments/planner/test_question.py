@@ -18,17 +18,20 @@ def without(name: str) -> dict[str, Any]:
 
 
 def test_width_follows_from_the_optics() -> None:
+    """r0 tells whether spots are speckled; the width of a PSF is without the pixel."""
     question = Question(**without("fwhm_px"), **OPTICS)
     # lambda / d = 1.2e-6 rad = 0.2475 arcsec = 1.98 px
     assert question.spots.fwhm_px == pytest.approx(0.886 * 1.98, rel=1e-3)
     assert question.spots.size == pytest.approx(0.99, rel=1e-3)
-
-
-def test_r0_tells_whether_spots_are_speckled() -> None:
-    calm = Question(**without("fwhm_px"), **OPTICS, r0_m=1.0)
-    rough = Question(**without("fwhm_px"), **OPTICS, r0_m=0.15)
+    calm, rough = (Question(**without("fwhm_px"), **OPTICS, r0_m=r0_m) for r0_m in (1.0, 0.15))
     assert calm.spots.d_over_r0 == 0.0
     assert rough.spots.d_over_r0 == pytest.approx(0.5 / (0.15 * 1.2**1.2))
+    of_psf = Question(**without("fwhm_px"), psf=PSF.analytic("gaussian"))
+    assert of_psf.spots.fwhm_px == pytest.approx(2.0, rel=0.02)  # linear interpolation of the half maximum
+    for fwhm_px, expected in ((1.5, 1.0), (4.0, 2.0)):
+        assert Question(**without("fwhm_px"), fwhm_px=fwhm_px).spots.search_range_px == expected
+    of_layout = Question(**without("pixels"), layout=Layout.grid((2, 2), pixels=(12, 10)))
+    assert of_layout.spots.shape == (12, 10)
 
 
 def test_magnitude_gives_electrons() -> None:
@@ -48,26 +51,11 @@ def test_what_estimators_know_of_an_emccd() -> None:
     assert scene.diffraction_px == pytest.approx(2.0 / 0.886, rel=2e-3)  # lambda / d
 
 
-@pytest.mark.parametrize(("fwhm_px", "expected"), [(1.5, 1.0), (4.0, 2.0)])
-def test_search_range_follows_the_width(fwhm_px: float, expected: float) -> None:
-    assert Question(**without("fwhm_px"), fwhm_px=fwhm_px).spots.search_range_px == expected
-
-
-@pytest.mark.parametrize(
-    ("budget", "expected"), [("0.1", 0.1), (0.1, 0.1), ("0.1 px", 0.1), ("0.05arcsec", 0.4), ("50mas", 0.4)]
-)
-def test_budget_in_any_unit(budget: Any, expected: float) -> None:
-    assert Question(**KNOWN, pixel_scale_arcsec=0.125, budget=budget).budget_px == pytest.approx(expected)
-
-
-def test_window_is_that_of_the_layout() -> None:
-    question = Question(**without("pixels"), layout=Layout.grid((2, 2), pixels=(12, 10)))
-    assert question.spots.shape == (12, 10)
-
-
-def test_width_of_a_psf_is_without_the_pixel() -> None:
-    question = Question(**without("fwhm_px"), psf=PSF.analytic("gaussian"))
-    assert question.spots.fwhm_px == pytest.approx(2.0, rel=0.02)  # linear interpolation of the half maximum
+def test_budget_in_any_unit() -> None:
+    budgets: Any = {"0.1": 0.1, 0.1: 0.1, "0.1 px": 0.1, "0.05arcsec": 0.4, "50mas": 0.4}
+    for budget, expected in budgets.items():
+        question = Question(**KNOWN, pixel_scale_arcsec=0.125, budget=budget)
+        assert question.budget_px == pytest.approx(expected)
 
 
 def test_what_cannot_be_is_named_in_one_line() -> None:

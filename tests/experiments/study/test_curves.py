@@ -33,10 +33,6 @@ def test_curve_holds_the_cells_of_a_configuration_by_flux() -> None:
     assert found[CONFIGURATION].at(31.0, "brightest") is None
 
 
-def test_unfinished_cells_are_left_out() -> None:
-    assert len(curve(unfinished=(0, 4)).flux_e) == 3
-
-
 def test_gain_at_an_error_is_that_at_the_flux_where_it_is_reached() -> None:
     item = curve()
     r = item.at(80.0, "brightest")
@@ -72,11 +68,9 @@ def test_interval_covers_the_truth_as_often_as_it_says() -> None:
 
 def test_without_a_curve_there_is_no_gain() -> None:
     rng = np.random.default_rng(1)
+    assert len(curve(unfinished=(0, 4)).flux_e) == 3  # the other cells
     assert gain_at_flux(curve(unfinished=(1, 2, 3, 4)), 10.0, rng, **TV_OVER_NO_TV) is None
     assert gain_at_flux(curve(), 5.0, rng, **TV_OVER_NO_TV) is None
     assert gain_at_error(curve(), 100.0, rng, **TV_OVER_NO_TV) is None
-
-
-def test_bad_input_is_refused() -> None:
     with refused("mode 'worst'"):
         study_curves(dataset(cells(), power_law(gain_of)), "worst")

@@ -2,6 +2,7 @@
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.signal import lfilter
 
 from faintspot.loop.control.identification.vibrations import Vibration
 
@@ -18,8 +19,6 @@ def driven(
     for each in every:
         one, two = each.recursion(rate_hz)
         driving = np.sqrt(slopes * each.driving_variance(rate_hz)) * each.rms_px
-        values = [0.0, 0.0]
-        for noise in driving * rng.standard_normal(frames + 1000):
-            values.append(one * values[-1] + two * values[-2] + noise)
-        total += values[-frames:]
+        noise = driving * rng.standard_normal(frames + 1000)
+        total += lfilter([1.0], [1.0, -one, -two], noise)[-frames:]
     return total

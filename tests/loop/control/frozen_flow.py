@@ -1,4 +1,4 @@
-"""Slopes of frozen turbulence as a sum of many plane waves: an oracle that shares nothing with the theory."""
+"""Slopes of frozen turbulence, an oracle that shares nothing with the theory; loops closed on such slopes."""
 
 import numpy as np
 
@@ -32,3 +32,22 @@ def frozen_slopes(air: SlopeTurbulence, frames: int, rate_hz: float, rng: np.ran
         total += np.cos(moved) @ (other[:, None] * cosine + one[:, None] * sine)
         total += np.sin(moved) @ (other[:, None] * sine - one[:, None] * cosine)
     return np.asarray(total * (R0_WAVELENGTH_M / (2 * np.pi) / air.pixel_scale_rad))
+
+
+def closed_loop(
+    open_loop: np.ndarray,
+    noise: np.ndarray,
+    matrix: np.ndarray,
+    inverse: np.ndarray,
+    *,
+    delay: int = 2,
+    loop_gain: float = 0.3,
+    seen: float | np.ndarray = 1.0,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return slopes and commands of an integrator with a leak of 1 %, whose sensor has the gain `seen`."""
+    slopes, commands = np.zeros_like(open_loop), np.zeros((len(open_loop) + delay, matrix.shape[1]))
+    for frame, turbulence in enumerate(open_loop):
+        slopes[frame] = seen * (turbulence + matrix @ commands[frame]) + noise[frame]
+        before = commands[frame + delay - 1]
+        commands[frame + delay] = 0.99 * before - loop_gain * inverse @ slopes[frame]
+    return slopes, commands[delay:]

@@ -1,6 +1,5 @@
 """What every controller must do: one suite, and a class for each controller."""
 
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -14,11 +13,10 @@ from tests.loop.control.control_cases import (
     PLANT,
     TURBULENCE,
 )
-from tests.loop.control.naive_guarded import Guarded
 
 from faintspot.loop.control.base import CommandDelayLine
 from faintspot.loop.control.integrator import CompiledIntegrator
-from faintspot.loop.control.kalman.compiled import CompiledKalman, Predictive
+from faintspot.loop.control.kalman.compiled import CompiledKalman
 from faintspot.loop.control.kalman.local_predictor import local_filter
 from faintspot.loop.control.kalman.modal_predictor import LargeGuarded
 from faintspot.loop.control.kalman.predictor import SlopePredictor
@@ -116,21 +114,9 @@ class TestCompiledIntegrator(ControllerTests):
         return CompiledIntegrator(line, INTERACTION, PLANT.reconstructor.matrix, GAIN, PLANT.leak)
 
 
-def predictor() -> SlopePredictor:
-    return SlopePredictor(MODEL, ERRORS**2)
-
-
-class TestGuardedKalman(ControllerTests):
-    def make(self, line: CommandDelayLine) -> Any:
-        def learnt(line: CommandDelayLine) -> Predictive:
-            return Predictive(line, INTERACTION, predictor(), PLANT.reconstructor.clean)
-
-        return Guarded(line, INTERACTION, PHASE, learnt, partial(PLANT.integrator, GAIN))
-
-
 class TestCompiledKalman(ControllerTests):
     def make(self, line: CommandDelayLine) -> Any:
-        return CompiledKalman(line, PLANT, PHASE, predictor(), GAIN)
+        return CompiledKalman(line, PLANT, PHASE, SlopePredictor(MODEL, ERRORS**2), GAIN)
 
 
 class TestLargeGuarded(ControllerTests):

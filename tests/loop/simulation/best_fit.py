@@ -28,17 +28,10 @@ class BestFit:
         vectors, size, _ = np.linalg.svd(columns, full_matrices=False)
         return cls(vectors[:, : np.count_nonzero(size > 1e-6 * size[0])], weight)
 
-    def fitted(self, wavefront: NDArray[np.floating]) -> NDArray[np.float32]:
-        """Return the mirror's best fit to a wavefront (points, points); 0 outside the pupil."""
-        inside = self.weight > 0
-        inverse = np.where(inside, 1 / np.where(inside, self.weight, 1), 0)
-        modes = self.basis.T @ (self.weight * wavefront.ravel())
-        fitted: NDArray[np.float32] = (inverse * (self.basis @ modes)).reshape(wavefront.shape)
-        return fitted.astype(np.float32)
-
     def residual(self, wavefront: NDArray[np.floating]) -> NDArray[np.float32]:
         """Return a wavefront (points, points) minus the mirror's best fit; 0 outside the pupil."""
-        residual: NDArray[np.float32] = np.where(
-            self.weight.reshape(wavefront.shape) > 0, wavefront - self.fitted(wavefront), 0
-        )
-        return residual.astype(np.float32)
+        weighted = self.weight * wavefront.ravel()
+        left = weighted - self.basis @ (self.basis.T @ weighted)
+        inside = self.weight > 0
+        residual = np.divide(left, self.weight, out=np.zeros_like(left), where=inside)
+        return np.asarray(residual.reshape(wavefront.shape), np.float32)

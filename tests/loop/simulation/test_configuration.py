@@ -5,41 +5,29 @@ import numpy as np
 import pytest
 from tests.refusals import refused
 
-from faintspot.base.errors import InputError
 from faintspot.loop.simulation import LoopConfiguration, load_loop, shipped_loops
 
-REGIMES = {
-    "canary",
-    "emccd",
-    "camera_3e",
-    "laboratory_16e",
-    "window_10",
-    "diffraction_limit",
-    "elongated_3e",
-    "elongated_10e",
-    "open_loop",
-    "eight_metre",
-}
+REGIMES = {"canary", "emccd", "camera_3e", "laboratory_16e", "window_10", "diffraction_limit"}
+REGIMES |= {"elongated_3e", "elongated_10e", "open_loop", "eight_metre"}
 
 
-def test_every_regime_is_shipped() -> None:
+def test_shipped_configurations_read_and_write() -> None:
     assert set(shipped_loops()) == REGIMES
-
-
-@pytest.mark.parametrize("name", sorted(REGIMES))
-def test_shipped_configurations_read_and_write(name: str) -> None:
-    loop = load_loop(name)
-    assert loop.name == name
-    assert loop == load_loop(f"{name}.toml")
-    assert LoopConfiguration.from_text(loop.to_text()) == loop
-    assert hash(loop) == hash(load_loop(name))
-    assert loop.run.photons_per_subaperture
+    for name in REGIMES:
+        loop = load_loop(name)
+        assert loop.name == name
+        assert loop == load_loop(f"{name}.toml")
+        assert LoopConfiguration.from_text(loop.to_text()) == loop
+        assert hash(loop) == hash(load_loop(name))
+        assert loop.run.photons_per_subaperture
 
 
 def test_a_file_goes_before_a_shipped_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     Path("canary.toml").write_text('name = "mine"\n[camera]\nphotons_per_subaperture = 3\n')
     assert load_loop("canary.toml").name == "mine"
+    (tmp_path / "canary").mkdir()  # as of results
+    assert load_loop("canary").name == "canary"
 
 
 def test_flux_by_magnitude() -> None:
@@ -63,59 +51,43 @@ def test_what_estimators_know() -> None:
     assert scene.spot_fwhm_px == pytest.approx(0.886 * 2.0 * np.sqrt(2.0))  # geometric mean
     r0_m = 0.15 * (loop.sensor.wavelength_m / 500e-9) ** 1.2
     assert scene.d_over_r0 == pytest.approx(0.6 / r0_m)
-    assert LoopConfiguration().scene.excess_noise == 1.0
-
-
-def test_sizes_of_the_default() -> None:
-    loop = LoopConfiguration()
-    assert loop.subaperture_m == pytest.approx(0.6)
-    assert loop.spot_width_px == pytest.approx(2.0)
+    plain = LoopConfiguration()
+    assert (plain.scene.excess_noise, plain.subaperture_m) == pytest.approx((1.0, 0.6))
+    assert plain.spot_width_px == pytest.approx(2.0)
 
 
 BAD = [
-    ("sensor", {"subaperture_m": 5.0}, "telescope.diameter_m = 4.2: expected at least one sub-aperture"),
-    ("sensor", {"subaperture_m": 0.3}, "expected enough to cover"),
-    ("sensor", {"samples": 6}, "sensor.samples = 6: expected at least 9"),
+    ("sensor", {"subaperture_m": 5.0}, "telescope.diameter_m = 4.2"),
+    ("sensor", {"subaperture_m": 0.3}, "sensor.subapertures"),
+    ("sensor", {"samples": 6}, "sensor.samples = 6"),
     ("sensor", {"spot_elongation": 8.0}, "sensor.samples"),
-    ("atmosphere", {"fraction": (1.0,)}, "one value for each layer"),
-    ("atmosphere", {"fraction": (0.0, 0.0, 0.0, 0.0)}, "above 0"),
-    ("atmosphere", {"r0_m": (0.2, 0.1)}, "[lowest, highest]"),
-    ("camera", {"magnitude": 10.0}, "either photons_per_subaperture or magnitude"),
-    ("camera", {"photons_per_subaperture": None}, "either photons_per_subaperture or magnitude"),
+    ("atmosphere", {"fraction": (1.0,)}, "fraction"),
+    ("atmosphere", {"fraction": (0.0, 0.0, 0.0, 0.0)}, "fraction"),
+    ("atmosphere", {"r0_m": (0.2, 0.1)}, "r0_m"),
+    ("camera", {"magnitude": 10.0}, "photons_per_subaperture"),
+    ("camera", {"photons_per_subaperture": None}, "photons_per_subaperture"),
     ("run", {"settle_frames": 2000}, "run.settle_frames = 2000"),
-    ("run", {"frame": 3}, "run.frame: unknown key; did you mean frames?"),
-    ("engine", {}, "unknown section"),
+    ("run", {"frame": 3}, "run.frame"),
+    ("engine", {}, "engine"),
 ]
 
 
-@pytest.mark.parametrize(("section", "values", "message"), BAD)
-def test_impossible_values_are_refused_in_one_line(
-    section: str, values: dict[str, Any], message: str
-) -> None:
-    with refused(message):
-        LoopConfiguration().replace(section, **values)
-
-
-def test_a_missing_file_names_what_is_shipped() -> None:
-    with pytest.raises(InputError, match=r"no such file.*canary"):
+def test_impossible_values_are_refused_in_one_line() -> None:
+    for section, values, message in BAD:
+        changed: Any = values
+        with refused(message):
+            LoopConfiguration().replace(section, **changed)
+    with refused("nothing.toml", "canary"):
         load_loop("nothing.toml")
-
-
-def test_a_folder_of_results_does_not_hide_a_shipped_configuration(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "canary").mkdir()
-    assert load_loop("canary").name == "canary"
 
 
 def test_slowed_loops_are_the_same_in_frames() -> None:
     loop = LoopConfiguration()
     slowed = loop.slowed_to(loop.control.frame_rate_hz / 5)
-    for speed, before in zip(
-        slowed.atmosphere.wind_speed_m_per_s, loop.atmosphere.wind_speed_m_per_s, strict=True
-    ):
-        assert speed / slowed.control.frame_rate_hz == pytest.approx(before / loop.control.frame_rate_hz)
+    now, before = (
+        np.divide(each.atmosphere.wind_speed_m_per_s, each.control.frame_rate_hz) for each in (slowed, loop)
+    )
+    np.testing.assert_allclose(now, before)
     assert slowed.photons == loop.photons
     with refused("frame_rate_hz"):
         loop.slowed_to(0.0)

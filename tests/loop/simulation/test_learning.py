@@ -44,17 +44,13 @@ def test_the_integrator_is_the_recursion() -> None:
 
 @pytest.mark.slow
 def test_never_below_the_integrator() -> None:
-    """The same slopes on the same air, the integrator's gain the best of three.
+    """The same slopes on the same air, of 250 scored frames: differences are paired.
 
-    Three runs of 250 scored frames: differences are paired, and 0.015 is three of their standard errors.
+    Of a run they scatter by 0.008.
     """
-
-    def strehl(method: Method) -> float:
-        return float(np.mean([simulate_loop(FAINT, [method], realisation=r).mean_strehl() for r in range(3)]))
-
-    plain = max(strehl(_method(gain=gain)) for gain in (0.2, 0.4, 0.6))
+    plain = max(simulate_loop(FAINT, [_method(gain=gain)]).mean_strehl() for gain in (0.4, 0.6))
     for kind in LEARNT:
-        assert strehl(_method(kind)) > plain - 0.015
+        assert simulate_loop(FAINT, [_method(kind)]).mean_strehl() > plain - 0.025
 
 
 @pytest.mark.slow

@@ -11,15 +11,32 @@ import faintspot as fs
 from faintspot.base.errors import MissingExtraError
 from faintspot.loop.simulation import load_loop
 from faintspot.loop.simulation.atmosphere import make_atmosphere
-from faintspot.loop.simulation.wavefront_sensor import ShackHartmann, make_mirror, make_pupil, make_sensor
+from faintspot.loop.simulation.wavefront_sensor import (
+    DeformableMirror,
+    PupilAmplitude,
+    ShackHartmann,
+    make_mirror,
+    make_pupil,
+    make_sensor,
+)
 
 skip_without("hcipy")
 FLAT = np.zeros((84, 84), np.float32)
 
 
 @pytest.fixture(scope="module")
-def sensor() -> ShackHartmann:
-    return make_sensor(quiet(), make_pupil(quiet()))
+def pupil() -> PupilAmplitude:
+    return make_pupil(quiet())
+
+
+@pytest.fixture(scope="module")
+def mirror(pupil: PupilAmplitude) -> DeformableMirror:
+    return make_mirror(quiet(), pupil)
+
+
+@pytest.fixture(scope="module")
+def sensor(pupil: PupilAmplitude) -> ShackHartmann:
+    return make_sensor(quiet(), pupil)
 
 
 def _tilt(sensor: ShackHartmann, x_px: float, y_px: float) -> np.ndarray:
@@ -28,9 +45,14 @@ def _tilt(sensor: ShackHartmann, x_px: float, y_px: float) -> np.ndarray:
 
 
 def test_36_sub_apertures_are_illuminated(sensor: ShackHartmann) -> None:
+    """About 95 % of the flux falls into the window; the rest is the wings, wider where partly lit."""
     assert len(sensor.layout) == 36
     assert sensor.illumination.min() > 0.5
     assert sensor.layout.frame_shape == (112, 112)
+    np.testing.assert_allclose(sensor.spots(FLAT).sum(axis=(1, 2)), 0.95 * sensor.illumination, rtol=0.05)
+    dark = quiet().replace("sensor", subapertures=1, samples=12, least_illumination=0.9)
+    with refused("0.9"):
+        make_sensor(dark, make_pupil(dark))
 
 
 def test_flat_spots_are_the_lenslets_diffraction(sensor: ShackHartmann) -> None:
@@ -40,11 +62,6 @@ def test_flat_spots_are_the_lenslets_diffraction(sensor: ShackHartmann) -> None:
     spot = sensor.spots(FLAT)[illuminated[0]]
     assert len(illuminated) > 4
     np.testing.assert_allclose(spot, expected, atol=3e-3 * expected.max())
-
-
-def test_flux_is_that_of_the_illuminated_part(sensor: ShackHartmann) -> None:
-    """About 95 % of the flux falls into the window; the rest is the wings, wider where partly lit."""
-    np.testing.assert_allclose(sensor.spots(FLAT).sum(axis=(1, 2)), 0.95 * sensor.illumination, rtol=0.05)
 
 
 def test_a_tilt_moves_the_spots(sensor: ShackHartmann) -> None:
@@ -97,51 +114,32 @@ def test_spots_are_as_long_as_asked() -> None:
     np.testing.assert_allclose(spot, spot[::-1, ::-1], atol=1e-6)
 
 
-def test_nothing_illuminated_is_refused() -> None:
-    dark = quiet().replace("sensor", subapertures=1, samples=12, least_illumination=0.9)
-    with refused("0.9"):
-        make_sensor(dark, make_pupil(dark))
-
-
-def test_commands_add_up() -> None:
-    pupil = make_pupil(quiet())
-    mirror = make_mirror(quiet(), pupil)
+def test_commands_add_up(pupil: PupilAmplitude, mirror: DeformableMirror) -> None:
+    """An actuator rises to its command and its neighbour to the crosstalk; tip and tilt have a unit rms."""
     assert mirror.commands == 52 + 2
-    rng = np.random.default_rng(1)
-    command = rng.normal(0, 100, mirror.commands)
+    assert make_mirror(quiet().replace("mirror", tip_tilt=False), pupil).commands == 52
+    command, (poke, tilt) = np.random.default_rng(1).normal(0, 100, mirror.commands), np.zeros((2, 54))
     expected = (mirror.matrix() @ command).reshape(84, 84)
     np.testing.assert_allclose(mirror.wavefront_nm(command), expected, atol=0.01)
-
-
-def test_an_actuator_rises_to_its_command_and_its_neighbour_to_the_crosstalk() -> None:
-    mirror = make_mirror(quiet(), make_pupil(quiet()))
-    poke = np.zeros(mirror.commands)
-    poke[30] = 100.0
+    poke[30], tilt[-1] = 100.0, 50.0
     surface = mirror.wavefront_nm(poke)
     assert surface.max() == pytest.approx(100, rel=0.01)  # points lie beside the actuator
     row, column = np.unravel_index(surface.argmax(), surface.shape)
     beside = column + 12 if column < 60 else column - 12
     assert surface[row, beside] == pytest.approx(15, rel=0.2)
-
-
-def test_tip_and_tilt_have_a_unit_rms() -> None:
-    pupil = make_pupil(quiet())
-    mirror = make_mirror(quiet(), pupil)
-    command = np.zeros(mirror.commands)
-    command[-1] = 50.0
-    assert pupil.rms(mirror.wavefront_nm(command)) == pytest.approx(50, rel=1e-4)
-    assert make_mirror(quiet().replace("mirror", tip_tilt=False), pupil).commands == 52
+    assert pupil.rms(mirror.wavefront_nm(tilt)) == pytest.approx(50, rel=1e-4)
+    left = BestFit.of(mirror, pupil).residual(mirror.wavefront_nm(command) + 77)  # takes off all of it
+    assert pupil.rms(left) < 0.1
 
 
 @pytest.mark.slow
-def test_fitting_error_is_that_of_theory() -> None:
+def test_fitting_error_is_that_of_theory(pupil: PupilAmplitude, mirror: DeformableMirror) -> None:
     """0.28 (pitch / r0)^(5/3) rad^2 is the usual number for a continuous mirror (Hudgin 1977, JOSA 67, 393).
 
     Gaussian influence functions do somewhat better; 0.19 to 0.30 is accepted. The Strehl ratio is then that
     of Marechal's exp(-variance) within 0.01.
     """
-    pupil = make_pupil(quiet())
-    fit = BestFit.of(make_mirror(quiet(), pupil), pupil)
+    fit = BestFit.of(mirror, pupil)
     atmosphere = make_atmosphere(quiet(), 2)
     residuals = [fit.residual(atmosphere.wavefront_nm(time)) for time in np.arange(0, 10, 0.5)]
     variance = float(np.mean([pupil.rms(left) ** 2 for left in residuals]))
@@ -151,52 +149,22 @@ def test_fitting_error_is_that_of_theory() -> None:
     assert strehl == pytest.approx(np.exp(-variance * (2 * np.pi / 1650) ** 2), abs=0.01)
 
 
-def test_the_best_fit_takes_off_what_the_mirror_can_do() -> None:
-    pupil = make_pupil(quiet())
-    mirror = make_mirror(quiet(), pupil)
-    command = np.random.default_rng(3).normal(0, 100, mirror.commands)
-    left = BestFit.of(mirror, pupil).residual(mirror.wavefront_nm(command) + 77)
-    assert pupil.rms(left) < 0.1
-
-
 WAVELENGTH_M = 1.65e-6
 
 
-@pytest.fixture(scope="module")
-def random_wavefront() -> np.ndarray:
-    rng = np.random.default_rng(1)
-    smooth = np.fft.ifft2(np.fft.fft2(rng.standard_normal((84, 84))) * np.exp(-np.arange(84) / 5)[:, None])
-    return np.asarray(smooth.real / smooth.real.std() * 150, np.float32)
-
-
-def test_the_pupil_is_an_annulus() -> None:
-    pupil = make_pupil(quiet())
+def test_strehl_is_the_peak_of_a_fraunhofer_propagation(pupil: PupilAmplitude) -> None:
+    """Of Gaussian phase it is Marechal's but for chance; points are cut by the edge of the annulus."""
     area = float(pupil.amplitude.sum()) * pupil.spacing_m**2
-    assert area == pytest.approx(np.pi / 4 * 4.2**2 * (1 - 0.29**2), rel=2e-3)  # points cut by the edge
-
-
-def test_a_flat_wavefront_is_perfect() -> None:
-    pupil = make_pupil(quiet())
-    field = pupil.field(np.full((84, 84), 123.0, np.float32), WAVELENGTH_M)
-    assert pupil.strehl(field) == pytest.approx(1, abs=1e-6)
-    assert pupil.rms(np.full((84, 84), 123.0)) == pytest.approx(0, abs=1e-3)
-
-
-def test_strehl_is_the_peak_of_a_fraunhofer_propagation(random_wavefront: np.ndarray) -> None:
-    pupil = make_pupil(quiet())
-    field = pupil.field(random_wavefront, WAVELENGTH_M)
-    padded = np.abs(np.fft.fft2(field, (336, 336))) ** 2
-    flat = np.abs(np.fft.fft2(pupil.amplitude, (336, 336))) ** 2
-    assert pupil.strehl(field) == pytest.approx(padded[0, 0] / flat[0, 0], rel=1e-4)
-
-
-def test_the_strehl_ratio_is_marechals() -> None:
-    pupil = make_pupil(quiet())
-    rng = np.random.default_rng(2)
-    wavefront = (50 * rng.standard_normal((84, 84))).astype(np.float32)
-    variance = (2e-9 * np.pi / WAVELENGTH_M * pupil.rms(wavefront)) ** 2
-    strehl = pupil.strehl(pupil.field(wavefront, WAVELENGTH_M))
-    assert strehl == pytest.approx(np.exp(-variance), abs=1e-3)  # Gaussian phase: exact but for chance
+    assert area == pytest.approx(np.pi / 4 * 4.2**2 * (1 - 0.29**2), rel=2e-3)
+    white = np.random.default_rng(2).standard_normal((84, 84))
+    smooth = np.fft.ifft2(np.fft.fft2(white) * np.exp(-np.arange(84) / 5)[:, None]).real
+    for wavefront, marechal in ((150 * smooth / smooth.std(), 1.0), (50 * white, 1e-3), (FLAT + 123, 1e-6)):
+        field = pupil.field(wavefront.astype(np.float32), WAVELENGTH_M)
+        padded = np.abs(np.fft.fft2(field, (336, 336))) ** 2
+        flat = np.abs(np.fft.fft2(pupil.amplitude, (336, 336))) ** 2
+        assert pupil.strehl(field) == pytest.approx(padded[0, 0] / flat[0, 0], rel=1e-4)
+        variance = (2e-9 * np.pi / WAVELENGTH_M * pupil.rms(wavefront)) ** 2
+        assert pupil.strehl(field) == pytest.approx(np.exp(-variance), abs=marechal)
 
 
 def test_a_missing_hcipy_is_said_in_one_line(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -20,15 +20,9 @@ SUBAPERTURE_M, PIXEL_ARCSEC, RATE_HZ = 0.6, 0.1, 250.0
 
 def corner_matrix() -> Floats:
     """Return slopes (2 n, commands) of a mirror with an actuator at each corner of the sub-apertures."""
-    corners = (SIDE + 1) ** 2
-    matrix = np.zeros((2, len(CELLS), corners))
-    for number, (row, column) in enumerate(CELLS):
-        for down in (0, 1):
-            for right in (0, 1):
-                corner = (row + down) * (SIDE + 1) + column + right
-                matrix[0, number, corner] = right - 0.5
-                matrix[1, number, corner] = down - 0.5
-    return matrix.reshape(-1, corners)
+    apart = np.argwhere(np.ones((SIDE + 1, SIDE + 1))) - CELLS[:, None]
+    beside = ((apart == 0) | (apart == 1)).all(axis=2)
+    return np.vstack([beside * (apart[..., axis] - 0.5) for axis in (1, 0)])
 
 
 MATRIX = corner_matrix()

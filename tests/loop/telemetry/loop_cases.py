@@ -4,7 +4,7 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-from tests.loop.control.frozen_flow import frozen_slopes
+from tests.loop.control.frozen_flow import closed_loop, frozen_slopes
 
 from faintspot.loop.control.identification.recording import Recording
 from faintspot.loop.control.reconstructor import make_reconstructor
@@ -33,12 +33,9 @@ def recorded(delay: int = 2, centroid_gain: float = 1.0, frames: int = 2600) -> 
     inside = ((apart == 0) | (apart == 1)).all(axis=2)
     interaction = np.vstack([inside * (apart[..., axis] - 0.5) for axis in (1, 0)])
     matrix = make_reconstructor(interaction).matrix
-    slopes, commands = np.empty_like(atmosphere), np.zeros((frames, len(CORNERS)))
-    for frame in range(frames):
-        held = commands[frame - delay] if frame >= delay else np.zeros(len(CORNERS))
-        noise = NOISE_PX * rng.standard_normal(len(interaction))
-        slopes[frame] = centroid_gain * (atmosphere[frame] + interaction @ held) + noise
-        commands[frame] = 0.99 * commands[frame - 1] - LOOP_GAIN * matrix @ slopes[frame]
+    noise = NOISE_PX * rng.standard_normal(atmosphere.shape)
+    gains: Any = {"loop_gain": LOOP_GAIN, "seen": centroid_gain, "delay": delay}
+    slopes, commands = closed_loop(atmosphere, noise, interaction, matrix, **gains)
     known: dict[str, Any] = {"subaperture_m": 0.6, "pixel_scale_arcsec": 0.2, "slope_unit": "px"}
     known |= {"frame": np.arange(50, frames), "name": "case"}
     return Recording(slopes[50:], commands[50:], interaction, CELLS, RATE_HZ, **known)

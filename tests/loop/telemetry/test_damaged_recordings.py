@@ -12,7 +12,7 @@ from faintspot.loop.control.identification.preparation import gains_of_pieces, p
 from faintspot.loop.control.identification.recording import Recording
 from faintspot.loop.telemetry.report import noise_of_loop
 
-FRAMES = 1600
+FRAMES = 1200
 HALF, THIRD = FRAMES // 2, FRAMES // 3
 
 
@@ -65,8 +65,6 @@ REFUSED: dict[str, tuple[Change, str]] = {
 }
 DOUBTED: dict[str, tuple[Change, str]] = {
     "the sign of x flips half way": (flipped, "usual gain"),
-    "a third without a star": (without_a_star, "usual gain"),
-    "a third without a star, the loop open": (open_between, "usual gain"),
     "a delay of 2 that becomes 3": (later_delay, "delay is"),
     "a camera that hangs half way": (
         lambda loop: with_rows(loop, slice(HALF, None), loop.slopes[HALF]),
@@ -81,18 +79,17 @@ def loop() -> Recording:
     return recorded(frames=FRAMES + 50)
 
 
-@pytest.mark.parametrize("change", [flipped, without_a_star, open_between])
-def test_commands_that_follow_otherwise_are_seen_in_pieces(loop: Recording, change: Change) -> None:
-    assert gains_of_pieces(prepared(change(loop)).recording).min() < 0.3
+def test_commands_that_follow_otherwise_are_seen_in_pieces(loop: Recording) -> None:
     assert gains_of_pieces(prepared(loop).recording) == pytest.approx(np.ones((8, 2)), abs=0.15)
+    for change in (flipped, without_a_star, open_between):
+        assert gains_of_pieces(prepared(change(loop)).recording).min() < 0.3
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", REFUSED)
-def test_refused(loop: Recording, name: str) -> None:
-    change, word = REFUSED[name]
-    with refused(word):
-        noise_of_loop(change(loop))
+def test_refused(loop: Recording) -> None:
+    for change, word in REFUSED.values():
+        with refused(word):
+            noise_of_loop(change(loop))
 
 
 @pytest.mark.slow

@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from tests.cli.cli_cases import Commands
-from tests.patience import mostly_slow
 from tests.slopes.recorded.recorded_cases import Page
 
 from faintspot.base.report.page import Report
@@ -34,9 +33,8 @@ def path(tmp_path: Path) -> Path:
     records["frame"], records["method"] = number + 10, method
     records["last_row_time_ns"] = 1_000_000 * number
     records["published_time_ns"] = records["last_row_time_ns"] + 50_000 + 10_000 * method
-    wave = (
-        0.3 + np.sin(number / 300)[:, None]
-    )  # of the air, the same in both methods; taken off over many turns
+    # Of the air, the same in both methods; taken off over many turns.
+    wave = 0.3 + np.sin(number / 300)[:, None]
     for axis in "xy":
         records[axis] = 0.5 + np.vectorize(RMS_PX.get)(method)[:, None] * rng.normal(size=(FRAMES, N))
         records[f"standard_error_{axis}"] = 0.1
@@ -97,12 +95,13 @@ def test_the_page_has_every_part_and_the_numbers_of_each_method(path: Path, run:
     run.refused("report", str(path), naming=("faintspot telemetry",))
 
 
-@pytest.mark.parametrize("n_frames", mostly_slow(1, [1, 7, 99]))
-def test_latencies_of_a_short_record_are_drawn(path: Path, n_frames: int) -> None:
-    night = read_telemetry(path)
-    arrays = {f.name: getattr(night, f.name) for f in fields(night)}
-    short = {name: value[:n_frames] if np.shape(value)[:1] == (len(night.frame),) else value
-             for name, value in arrays.items()}  # fmt: skip
-    axes = latency_figure(Telemetry(**short)).figure.axes[1]
-    assert all(np.size(line.get_xdata()) >= min(n_frames, 20) for line in axes.lines)
-    assert all(line.get_marker() == "o" for line in axes.lines)
+def test_latencies_of_a_short_record_are_drawn(night: Telemetry) -> None:
+    arrays = {field.name: getattr(night, field.name) for field in fields(night)}
+    for frames in (1, 7, 99):
+        short = {
+            name: value[:frames] if np.shape(value)[:1] == (len(night.frame),) else value
+            for name, value in arrays.items()
+        }
+        axes = latency_figure(Telemetry(**short)).figure.axes[1]
+        assert all(np.size(line.get_xdata()) >= min(frames, 20) for line in axes.lines)
+        assert all(line.get_marker() == "o" for line in axes.lines)

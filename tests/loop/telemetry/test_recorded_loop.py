@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tests.cli.cli_cases import Commands
 from tests.io import loop_layouts
 from tests.io.telemetry_files import ATTRIBUTES, IMAGE, RECORD, SIZES, images_of, records_of
 from tests.loop.telemetry.loop_cases import CELLS, recorded
@@ -14,7 +13,6 @@ from tests.patience import mostly_slow
 from tests.refusals import refused
 
 import faintspot as fs
-from faintspot.base.errors import InputError
 from faintspot.base.flags import SubapertureFlag
 from faintspot.engine.telemetry.recorder import TelemetryStore
 from faintspot.io import create_writer, read_telemetry, write_aot
@@ -46,44 +44,41 @@ def same(found: Any) -> None:
     assert (found.frame_rate_hz, found.subaperture_m, found.pixel_scale_arcsec) == (250.0, 0.6, 0.2)
 
 
+def written(folder: Path, **more: Any) -> Any:
+    """Write a recording with its words; return what is read."""
+    np.savez(folder / "night.npz", **{**arrays(), **more})
+    (folder / "system.toml").write_text(WORDS)
+    return read_recorded_loop(folder / "night.npz", folder / "system.toml")
+
+
 def test_npz_with_words(tmp_path: Path) -> None:
-    np.savez(tmp_path / "night.npz", **arrays())
-    (tmp_path / "system.toml").write_text(WORDS)
-    same(read_recorded_loop(tmp_path / "night.npz", tmp_path / "system.toml"))
+    """Slopes that are not valid are left out."""
+    same(written(tmp_path))
+    flags = np.zeros((2550, 25), np.uint8)
+    flags[:, 3], flags[7, 4] = 1, 128
+    loop = written(tmp_path, slopes=np.where(np.arange(50) == 30, np.nan, arrays()["slopes"]), flags=flags)
+    line = "slopes: left out 2 of 25 sub-apertures, 1 slope of others: dark, not finite, limited"
+    assert line in loop.remarks
+    assert np.isnan(loop.slopes[:, [3, 28, 5, 30]]).all()
+    assert np.isnan(loop.slopes).sum() == 4 * 2550 + 2
 
 
 @pytest.mark.usefixtures("undrawn_pictures")
 def test_fluxes_have_a_part_of_the_report(tmp_path: Path) -> None:
-    rng, found = np.random.default_rng(1), arrays()
+    rng = np.random.default_rng(1)
     light = np.exp(0.4 * np.sin(np.arange(2550) / 7.0))[:, None]
-    np.savez(tmp_path / "night.npz", **found, flux=rng.poisson(200 * light, (2550, 25)))
-    (tmp_path / "system.toml").write_text(WORDS)
-    loop = read_recorded_loop(tmp_path / "night.npz", tmp_path / "system.toml")
+    loop = written(tmp_path, flux=rng.poisson(200 * light, (2550, 25)))
     _, report = _begun(loop)
     _scintillation(report, 0.8)
     index = report.parts["scintillation"].values[0]
     assert index.value == pytest.approx((light.std() / light.mean()) ** 2, rel=0.1)
     assert len(report.as_values()["scintillation"]["of_subapertures"]) == 25
     assert "scintillation" in {section.name for section in page_of_loop(report).sections}
-    with pytest.raises(InputError):
+    with refused("level"):
         report_of_loop(loop, fade_level=0.0)
-    with pytest.raises(InputError):
+    with refused("flux"):
         replace(loop, flux=loop.flux[:, 1:])
     assert "scintillation" not in _begun(replace(loop, flux=None))[1].parts
-
-
-def test_slopes_that_are_not_valid_are_left_out(tmp_path: Path) -> None:
-    found = arrays()
-    flags = np.zeros((2550, 25), np.uint8)
-    flags[:, 3], flags[7, 4] = 1, 128
-    found["slopes"] = np.where(np.arange(50) == 30, np.nan, found["slopes"])
-    np.savez(tmp_path / "night.npz", **found, flags=flags)
-    (tmp_path / "system.toml").write_text(WORDS)
-    loop = read_recorded_loop(tmp_path / "night.npz", tmp_path / "system.toml")
-    line = "slopes: left out 2 of 25 sub-apertures, 1 slope of others: dark, not finite, limited"
-    assert line in loop.remarks
-    assert np.isnan(loop.slopes[:, [3, 28, 5, 30]]).all()
-    assert np.isnan(loop.slopes).sum() == 4 * 2550 + 2
 
 
 def test_toml_that_names_arrays(tmp_path: Path) -> None:
@@ -158,17 +153,11 @@ def test_aot_file_is_read(tmp_path: Path) -> None:
     system.sources, system.wavefront_sensors = [source], [sensor]
     system.wavefront_correctors = [mirror]
     matrix = found["interaction_matrix"].reshape(2, 25, 36).swapaxes(0, 1)
-    system.loops = [
-        aotpy.ControlLoop(
-            "loop",
-            input_sensor=sensor,
-            commanded_corrector=mirror,
-            commands=aotpy.Image("commands", found["commands"]),
-            interaction_matrix=aotpy.Image("matrix", matrix),
-            framerate=250.0,
-            delay=2.0,
-        )
-    ]
+    loop = aotpy.ControlLoop("loop", input_sensor=sensor, commanded_corrector=mirror)
+    loop.framerate, loop.delay = 250.0, 2.0
+    loop.commands = aotpy.Image("commands", found["commands"])
+    loop.interaction_matrix = aotpy.Image("matrix", matrix)
+    system.loops = [loop]
     system.write_to_file(tmp_path / "night.fits")
     with refused("slope_unit", "--slope-unit"):
         read_recorded_loop(tmp_path / "night.fits")
@@ -180,23 +169,6 @@ def test_aot_file_is_read(tmp_path: Path) -> None:
     assert loop.pixel_scale_arcsec == pytest.approx(0.2)
 
 
-@pytest.mark.slow
-def test_the_command_writes_a_page_and_its_numbers(
-    tmp_path: Path, run: Commands, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A page and its numbers of 500 frames, from which other choices are not known."""
-    pytest.importorskip("matplotlib")
-    pytest.importorskip("jinja2")
-    monkeypatch.chdir(tmp_path)
-    found = arrays() | {name: arrays()[name][:500] for name in ("slopes", "commands")}
-    np.savez("night.npz", **found)
-    Path("system.toml").write_text(WORDS)
-    run.ok("telemetry", "night.npz", "--system", "system.toml")
-    assert "Other choices of control" in Path("night.html").read_text()
-    assert Path("night.json").stat().st_size > 1000
-    run.refused("telemetry", "absent.npz", naming=("no such file",))
-
-
 def small() -> dict[str, Any]:
     """Arrays and numbers of a recording of four sub-apertures."""
     slopes = np.random.default_rng(1).standard_normal((20, 8))
@@ -204,54 +176,52 @@ def small() -> dict[str, Any]:
 
 
 COLUMN = np.arange(20)[:, None]
-WRONG: list[tuple[str, Any, str]] = [
-    ("time_s", 3.0, "expected 20 increasing numbers"),
-    ("frame", 3, "expected 20 increasing numbers"),
-    ("frame", COLUMN.astype(str), "real numbers"),
-    ("frame", COLUMN + 0.5, "whole number"),
-    ("frame", COLUMN * 1j, "real numbers"),
-    ("slopes", 3.0, "dimensions"),
-    ("slopes", np.zeros((20, 9)), "expected shape"),
-    ("commands", np.zeros((7, 36)), "20 frames"),
-    ("interaction_matrix", np.ones((8, 2)), r"expected shape \(8, 3\)"),
-    ("time_s", np.zeros(20), "20 increasing numbers"),
-    ("flags", np.zeros((20, 3), int), "shape"),
-    ("slope", 1.0, "did you mean slopes"),
-    ("slopes", np.full((20, 8), "1.5"), "real numbers"),
-    ("slopes", np.full((20, 8), 1j), "real numbers"),
-    ("commands", 3.0, "dimensions"),
-    ("control_matrix", 3.0, "dimensions"),
-    ("cells", 3, "expected shape"),
-    ("cells", np.zeros((4, 2)), "one twice"),
-    ("cells", [[0, 0], [0, 1], [10**6, 0], [1, 1]], "at most 1000"),
-    ("cells", np.full((4, 2), 1e300), "expected a number"),
-    ("cells", [[0, 0], [0, 1], [1, 0], [1, 0.5]], "whole number"),
-    *((name, True, "got true or false") for name in NUMBERS),
-    *((name, 1e300, "expected a number from") for name in NUMBERS),
-    *((name, 1e-300, "expected a") for name in NUMBERS),
-    *((name, [1.0, 2.0], "one number|expected a number") for name in NUMBERS),
-]
+WRONG: dict[str, list[Any]] = {
+    "time_s": [3.0, np.zeros(20)],
+    "frame": [3, COLUMN.astype(str), COLUMN + 0.5, COLUMN * 1j],
+    "slopes": [3.0, np.zeros((20, 9)), np.full((20, 8), "1.5"), np.full((20, 8), 1j)],
+    "commands": [3.0, np.zeros((7, 36))],
+    "interaction_matrix": [np.ones((8, 2))],
+    "control_matrix": [3.0],
+    "flags": [np.zeros((20, 3), int)],
+    "slope": [1.0],
+    "cells": [
+        3,
+        np.zeros((4, 2)),
+        [[0, 0], [0, 1], [10**6, 0], [1, 1]],
+        np.full((4, 2), 1e300),
+        [[0, 0], [0, 1], [1, 0], [1, 0.5]],
+    ],
+    **{name: [True, 1e300, 1e-300, [1.0, 2.0]] for name in NUMBERS},
+}
 
 
-@pytest.mark.parametrize(("name", "value", "expected"), WRONG)
-def test_values_that_are_wrong(tmp_path: Path, name: str, value: Any, expected: str) -> None:
-    np.savez(tmp_path / "night.npz", **{**small(), name: value})
-    with pytest.raises(InputError, match=rf"{name}.*({expected})"):
-        read_recorded_loop(tmp_path / "night.npz")
+def test_values_that_are_wrong(tmp_path: Path) -> None:
+    for name, values in WRONG.items():
+        for value in values:
+            np.savez(tmp_path / "night.npz", **{**small(), name: value})
+            with refused(name):
+                read_recorded_loop(tmp_path / "night.npz")
+    for text in ("3", "[[1, 2], [3]]", '[["a", "b"]]', "true", "[]", "{a = 1}"):
+        (tmp_path / "night.toml").write_text(f'slopes = {text}\nslope_unit = "px"\nframe_rate_hz = 250')
+        with refused("slopes"):
+            read_recorded_loop(tmp_path / "night.toml")
+    slopes = small()["slopes"]
+    slopes[:, 7] *= 1e10
+    with refused("columns 7"):
+        prepared(Recording(slopes, None, None, np.ones((2, 2)), 250.0))
 
 
-@pytest.mark.parametrize("value", ["3", "[[1, 2], [3]]", '[["a", "b"]]', "true", "[]", "{a = 1}"])
-def test_arrays_of_toml_that_are_wrong(tmp_path: Path, value: str) -> None:
-    (tmp_path / "night.toml").write_text(f'slopes = {value}\nslope_unit = "px"\nframe_rate_hz = 250')
-    with pytest.raises(InputError, match="slopes: expected"):
-        read_recorded_loop(tmp_path / "night.toml")
-
-
-def test_columns_are_times_and_frame_numbers(tmp_path: Path) -> None:
-    """As a CSV of one column is read."""
+def test_rows_of_files(tmp_path: Path) -> None:
+    """Times and frame numbers in a column, as a CSV is read; a first row not measured is no line of names."""
     np.savez(tmp_path / "night.npz", **small(), time_s=COLUMN / 125, frame=2 * COLUMN)
     loop = read_recorded_loop(tmp_path / "night.npz")
     assert np.array_equal(loop.frame, 2 * np.arange(20))
+    (tmp_path / "night.csv").write_text("x,y\n,nan\n1,2\n3,4\n")
+    stated: dict[str, Any] = {"slope_unit": "px", "frame_rate_hz": 9.0, "cells": [[0, 0]]}
+    (tmp_path / "system.toml").write_text("".join(f"{name} = {value!r}\n" for name, value in stated.items()))
+    loop = read_recorded_loop(tmp_path / "night.csv", tmp_path / "system.toml")
+    np.testing.assert_array_equal(loop.slopes, [[np.nan] * 2, [1, 2], [3, 4]])
 
 
 def test_frame_rate_of_frames_that_were_buffered() -> None:
@@ -259,21 +229,6 @@ def test_frame_rate_of_frames_that_were_buffered() -> None:
     frame = np.delete(np.arange(1000), slice(400, 420))
     time_s = (frame // 10 * 10) / 250 + frame % 10 * 1e-6 + 7.0 * (frame > 700)
     assert frame_rate(time_s, frame) == pytest.approx(250, rel=1e-3)
-
-
-def test_a_first_row_that_is_not_measured_is_no_line_of_names(tmp_path: Path) -> None:
-    (tmp_path / "night.csv").write_text("x,y\n,nan\n1,2\n3,4\n")
-    (tmp_path / "system.toml").write_text('slope_unit = "px"\nframe_rate_hz = 9\ncells = [[0, 0]]')
-    loop = read_recorded_loop(tmp_path / "night.csv", tmp_path / "system.toml")
-    np.testing.assert_array_equal(loop.slopes, [[np.nan] * 2, [1, 2], [3, 4]])
-
-
-def test_slopes_of_very_different_size_are_broken() -> None:
-    slopes = small()["slopes"]
-    slopes[:, 7] *= 1e10
-    loop = Recording(slopes, None, None, np.ones((2, 2)), 250.0)
-    with refused("columns 7"):
-        prepared(loop)
 
 
 def test_slopes_of_frames_are_those_of_an_open_loop(tmp_path: Path) -> None:
@@ -342,7 +297,7 @@ def test_a_question_at_a_time(tmp_path: Path) -> None:
     ]
     stated: dict[str, Any] = {}
     for name, answer in answers:
-        with pytest.raises(InputError, match=name.replace("_", "[-_]")):
+        with refused(match=name.replace("_", "[-_]")):
             read_recorded_loop(tmp_path / "loop.npz", stated=stated)
         stated[name] = answer
     loop = read_recorded_loop(tmp_path / "loop.npz", stated=stated)
@@ -375,15 +330,14 @@ def test_tip_tilt_of_keck(tmp_path: Path) -> None:
     assert 0 < delay.error < 0.2
 
 
-@pytest.mark.parametrize("order", ["axes", "pairs"])
-def test_slopes_of_a_folder_in_three_dimensions(tmp_path: Path, order: str) -> None:
+def test_slopes_of_a_folder_in_three_dimensions(tmp_path: Path) -> None:
     """(frames, n, 2) says itself which is x; the order is that of flat rows."""
     slopes = np.random.default_rng(1).standard_normal((30, 9, 2))
     np.save(tmp_path / "slopes.npy", slopes)
     stated: dict[str, float | str] = {"slope_unit": "px", "frame_rate_hz": 100.0, "loop": "open"}
-    stated["slope_order"] = order
-    loop: Any = read_recorded_loop(tmp_path, stated=stated)
-    np.testing.assert_array_equal(loop.slopes, np.hstack([slopes[..., 0], slopes[..., 1]]))
+    for order in ("axes", "pairs"):
+        loop: Any = read_recorded_loop(tmp_path, stated={**stated, "slope_order": order})
+        np.testing.assert_array_equal(loop.slopes, np.hstack([slopes[..., 0], slopes[..., 1]]))
 
 
 @pytest.mark.slow

@@ -11,8 +11,16 @@ from tests.patience import mostly_slow
 from faintspot.loop.control.identification.layers import Identification
 from faintspot.loop.control.identification.loop_delay import LoopDelay
 from faintspot.loop.control.identification.open_loop import Measured, open_loop_of
+from faintspot.loop.control.identification.recording import Recording
 from faintspot.loop.control.identification.vibrations import MODES
 from faintspot.loop.telemetry.spectra import OTHERS, modal_spectra, recorded_discrepancy
+
+
+def found_in_still_air(loop: Recording) -> list[Measured]:
+    """Return rotation and gain, with winds that are not known."""
+    seen = open_loop_of(loop, LoopDelay(2.0, 0.0, 1.0, 0.0))
+    identified = Identification(seen.telemetry, loop.site, loop.frame_rate_hz)
+    return recorded_discrepancy(loop, seen, identified.of_winds(np.zeros((1, 2))))
 
 
 def found(change: np.ndarray, missing: float = 0.0) -> list[Measured]:
@@ -22,9 +30,7 @@ def found(change: np.ndarray, missing: float = 0.0) -> list[Measured]:
     slopes = loop.slopes @ whole.T
     slopes[:, np.random.default_rng(1).random(slopes.shape[1]) < missing] = np.nan
     loop = replace(loop, slopes=slopes, interaction_matrix=whole @ loop.interaction_matrix)
-    seen = open_loop_of(loop, LoopDelay(2.0, 0.0, 1.0, 0.0))
-    identified = Identification(seen.telemetry, loop.site, loop.frame_rate_hz)
-    return recorded_discrepancy(loop, seen, identified.of_winds(np.zeros((1, 2))))
+    return found_in_still_air(loop)
 
 
 @pytest.mark.slow
@@ -44,9 +50,7 @@ def test_too_few_slopes() -> None:
     loop = recorded()
     slopes = np.full_like(loop.slopes, np.nan)
     slopes[:, [0, 25]] = loop.slopes[:, [0, 25]]
-    seen = open_loop_of(replace(loop, slopes=slopes), LoopDelay(2.0, 0.0, 1.0, 0.0))
-    identified = Identification(seen.telemetry, loop.site, loop.frame_rate_hz)
-    for each in recorded_discrepancy(loop, seen, identified.of_winds(np.zeros((1, 2)))):
+    for each in found_in_still_air(replace(loop, slopes=slopes)):
         assert not np.isfinite(each.value)
         assert "too few" in each.remark
 
@@ -55,9 +59,7 @@ def test_too_few_slopes() -> None:
 def test_noise_hides_both() -> None:
     loop = recorded().part(slice(0, 500))
     noise = np.random.default_rng(1).normal(0.0, 1.0, loop.slopes.shape)
-    seen = open_loop_of(replace(loop, slopes=noise, commands=None), LoopDelay(2.0, 0.0, 1.0, 0.0))
-    identified = Identification(seen.telemetry, loop.site, loop.frame_rate_hz)
-    for each in recorded_discrepancy(loop, seen, identified.of_winds(np.zeros((1, 2)))):
+    for each in found_in_still_air(replace(loop, slopes=noise, commands=None)):
         assert not np.isfinite(each.value)
         assert each.remark
 

@@ -6,7 +6,6 @@ from tests.loop.control.control_cases import TURBULENCE
 from tests.loop.control.frozen_flow import frozen_slopes
 from tests.refusals import refused
 
-from faintspot.base.errors import InputError
 from faintspot.loop.control.base import OpenLoopTelemetry
 from faintspot.loop.control.identification.layers import Identification, Identified
 from faintspot.loop.control.identification.vibrations import Vibration, mode_shapes
@@ -67,33 +66,22 @@ def test_gradients_of_smaller_squares_are_found() -> None:
 
 
 @pytest.mark.slow
-def test_gaps_and_missing_subapertures() -> None:
-    """A twentieth of the slopes, sixty frames and three sub-apertures were not measured."""
-    telemetry = observed()
-    missing = np.random.default_rng(3).random(telemetry.open_loop_px.shape) < 0.05
+def test_gaps_and_slopes_that_tell_little_do_not_count() -> None:
+    """A twentieth of the slopes, sixty frames and three sub-apertures were not measured.
+
+    A fifth is mostly an estimator's prior, with three times the stated error.
+    """
+    telemetry, rng = observed(), np.random.default_rng(4)
+    poor, missing = rng.random(telemetry.open_loop_px.shape) < 0.2, rng.random(telemetry.trust.shape) < 0.05
+    wrong = 0.5 * np.sqrt(90.0) * rng.standard_normal(poor.shape)
     missing[400:420] = missing[900:940] = True
     missing[:, [3, 7, 12, 28, 32, 37]] = True
-    lost = OpenLoopTelemetry(
-        np.where(missing, 50.0, telemetry.open_loop_px),
-        np.where(missing, np.inf, telemetry.variance_px2),
+    damaged = OpenLoopTelemetry(
+        np.where(missing, 50.0, telemetry.open_loop_px + np.where(poor, wrong, 0.0)),
+        np.where(missing, np.inf, np.where(poor, 10.0, 1.0) * telemetry.variance_px2),
         np.where(missing, 0.0, 1.0),
     )
-    expect_winds(Identification(lost, UNKNOWN, RATE_HZ).layers(), 1.0)
-
-
-@pytest.mark.slow
-def test_slopes_that_tell_little_do_not_count() -> None:
-    """A fifth of the slopes is mostly an estimator's prior, with three times the stated error."""
-    telemetry = observed()
-    rng = np.random.default_rng(4)
-    poor = rng.random(telemetry.open_loop_px.shape) < 0.2
-    wrong = 0.5 * np.sqrt(90.0) * rng.standard_normal(poor.shape)
-    tail = OpenLoopTelemetry(
-        telemetry.open_loop_px + np.where(poor, wrong, 0.0),
-        np.where(poor, 10.0, 1.0) * telemetry.variance_px2,
-        telemetry.trust,
-    )
-    found = Identification(tail, UNKNOWN, RATE_HZ).layers()
+    found = Identification(damaged, UNKNOWN, RATE_HZ).layers()
     expect_winds(found, 1.0)
     # Interpolation in their place halves the noise of a fifth.
     assert found.noise_factor == pytest.approx(1.2**-2, rel=0.2)
@@ -122,9 +110,7 @@ def test_a_vibration_is_found_and_part_of_the_model() -> None:
     """A tilt of 45 Hz on top of turbulence: the winds stay what they are."""
     telemetry = observed()
     shape = mode_shapes(AIR.positions_m)[1]
-    shaking = (
-        np.sqrt(50) * 0.4 * np.sqrt(2) * np.sin(2 * np.pi * 45.0 / RATE_HZ * np.arange(len(telemetry)) + 1)
-    )
+    shaking = 4.0 * np.sin(2 * np.pi * 45.0 / RATE_HZ * np.arange(len(telemetry)) + 1)  # 0.4 px of 50 slopes
     shaken = replace(telemetry, open_loop_px=telemetry.open_loop_px + shaking[:, None] * shape)
     found = Identification(shaken, UNKNOWN, RATE_HZ).layers()
     (vibration,) = found.vibrations
@@ -152,7 +138,7 @@ def test_too_little_is_refused() -> None:
     with refused("telemetry", "32"):
         Identification(telemetry.part(0, 20), UNKNOWN, RATE_HZ)
     unmeasured = replace(telemetry, variance_px2=np.full(telemetry.variance_px2.shape, np.inf))
-    with pytest.raises(InputError, match="measured in half of the frames, got none"):
+    with refused("none"):
         Identification(unmeasured, UNKNOWN, RATE_HZ)
 
 
@@ -164,10 +150,8 @@ def test_waves_between_the_subapertures_are_no_vibration() -> None:
     wave = np.cos(np.pi * (column - 0.5)) + 4 / 42 * column  # without tip and focus
     slopes = 0.1 * np.random.default_rng(4).standard_normal((1500, 160))
     slopes[:, :80] += 0.3 * wave * np.sin(2 * np.pi * 16.0 * time_s)[:, None]
-    site, winds = (
-        replace(UNKNOWN, positions_m=np.asarray(0.6 * cells[:, ::-1], np.float64)),
-        np.array([[9.0, 0.0]]),
-    )
+    site = replace(UNKNOWN, positions_m=np.asarray(0.6 * cells[:, ::-1], np.float64))
+    winds = np.array([[9.0, 0.0]])
 
     def found() -> tuple[Vibration, ...]:
         telemetry = OpenLoopTelemetry(slopes, np.full(slopes.shape, 0.01), np.ones(slopes.shape))

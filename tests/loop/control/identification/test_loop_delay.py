@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter1d
 from tests.loop.control.control_cases import FRAME_S, INTERACTION, LAYERS, PLANT, TURBULENCE, telemetry
-from tests.loop.control.frozen_flow import frozen_slopes
+from tests.loop.control.frozen_flow import closed_loop, frozen_slopes
 from tests.loop.telemetry.loop_cases import AIR, RATE_HZ, recorded
 
 from faintspot.loop.control.identification.loop_delay import DelayFits, LoopDelay, with_axes
@@ -53,9 +53,8 @@ def test_errors_of_gains_are_those_of_least_squares() -> None:
     context = sent, np.zeros(frames, np.int64), site, RATE_HZ
     slopes = gains * delayed + 0.8 * rng.standard_normal((frames, 8))
     gain, error, _ = DelayFits(slopes, *context, axis=0).gains_of(2.0)[3]
-    least = (
-        0.8 / 0.5 / np.sqrt(3 * frames)
-    )  # three modes without tip; strengths of turbulence are fitted, too
+    # Three modes without tip; strengths of turbulence are fitted, too.
+    least = 0.8 / 0.5 / np.sqrt(3 * frames)
     assert error == pytest.approx(least / np.sqrt(0.55), rel=0.15)
     assert abs(gain - 0.9) < 3 * error
     seen = with_axes(LoopDelay(2.0, 0.1, 0.6, 0.05), slopes, *context)
@@ -72,10 +71,8 @@ def test_gain_in_bright_turbulence_without_fine_structure() -> None:
     """Within two errors. Turbulence of von Karman falls less steeply, and alone gave 0.51 +- 0.25."""
     rng = np.random.default_rng(3)
     turbulence = gaussian_filter1d(rng.standard_normal((2000, 18)), 5.0, axis=0)
-    slopes, commands = 0.02 * rng.standard_normal((2000, 18)), np.zeros((2000, 12))
-    for frame in range(2, 2000):
-        slopes[frame] += turbulence[frame] + INTERACTION @ commands[frame - 2]
-        commands[frame] = 0.99 * commands[frame - 1] - 0.3 * PLANT.reconstructor.matrix @ slopes[frame]
+    noise = 0.02 * rng.standard_normal((2000, 18))
+    slopes, commands = closed_loop(turbulence, noise, INTERACTION, PLANT.reconstructor.matrix)
     context = slopes, commands @ INTERACTION.T, np.zeros(2000, np.int64), TURBULENCE, 1 / FRAME_S
     seen = DelayFits(*context).of(2.0)
     assert abs(seen.gain - 1.0) < 2 * seen.gain_error < 0.4
@@ -87,12 +84,9 @@ def test_gains_of_x_and_y(of_x: float, of_y: float) -> None:
     """Their ratio is used where it differs from 1 by three of its errors, of 10 % here; else 1 is."""
     gains = np.repeat([of_x, of_y], 9)
     atmosphere = telemetry(4000, 0.0, model=LAYERS).open_loop_px
-    rng = np.random.default_rng(4)
-    slopes, commands = np.zeros_like(atmosphere), np.zeros((4000, 12))
-    for frame in range(2, 4000):
-        seen = gains * (atmosphere[frame] + INTERACTION @ commands[frame - 2])
-        slopes[frame] = seen + 0.1 * rng.standard_normal(18)
-        commands[frame] = 0.99 * commands[frame - 1] - 0.3 * PLANT.reconstructor.matrix @ slopes[frame]
+    noise = 0.1 * np.random.default_rng(4).standard_normal(atmosphere.shape)
+    loop = INTERACTION, PLANT.reconstructor.matrix
+    slopes, commands = closed_loop(atmosphere, noise, *loop, seen=gains)
     context = slopes, commands @ INTERACTION.T, np.zeros(4000, np.int64), TURBULENCE, 1 / FRAME_S
     seen = with_axes(DelayFits(*context).of(2.0), *context)
     assert abs(seen.measured_x_to_y - of_x / of_y) < 3 * seen.x_to_y_error < 0.5
@@ -116,10 +110,7 @@ def test_gain_of_a_large_sensor() -> None:
     beside = (np.abs(apart) < 1).all(axis=2)
     matrix = np.vstack([beside * np.sign(apart[..., axis]) / 2 for axis in (1, 0)])
     inverse = make_reconstructor(matrix).matrix
-    slopes, commands = np.zeros_like(turbulence), np.zeros((frames, matrix.shape[1]))
-    for frame in range(2, frames):
-        slopes[frame] = gain * (turbulence[frame] + matrix @ commands[frame - 2]) + noise[frame]
-        commands[frame] = 0.99 * commands[frame - 1] - 0.3 * inverse @ slopes[frame]
+    slopes, commands = closed_loop(turbulence, noise, matrix, inverse, seen=gain)
     context = slopes[100:], commands[100:] @ matrix.T, np.zeros(frames - 100, np.int64), air, rate_hz
     seen = DelayFits(*context).of(2.0)
     assert abs(seen.gain - gain) < 3 * seen.gain_error

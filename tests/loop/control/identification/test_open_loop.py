@@ -1,5 +1,6 @@
 """Geometry and gaps of recorded loops."""
 
+import math
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -8,16 +9,19 @@ import pytest
 from tests.loop.telemetry.loop_cases import AIR, recorded
 from tests.refusals import refused
 
-from faintspot.base.errors import InputError
+from faintspot.base.text_files import plain_values
 from faintspot.loop.control.identification import open_loop
 from faintspot.loop.control.identification.layers import Identified
 from faintspot.loop.control.identification.loop_delay import LoopDelay
 from faintspot.loop.control.identification.open_loop import (
+    Measured,
     measured_delay,
     open_loop_of,
+    outer_scale_and_r0,
     winds_of,
 )
 from faintspot.loop.control.identification.recording import Recording
+from faintspot.loop.turbulence_strength import TurbulenceStrength
 
 
 def test_an_unknown_sub_aperture_is_the_unit_of_length() -> None:
@@ -40,7 +44,7 @@ def test_frames_without_slopes_are_gaps() -> None:
     with refused("326", "300", "1 gaps"):
         measured_delay(replace(loop, slopes=slopes))
     slopes[:] = np.nan
-    with pytest.raises(InputError, match="expected frames with most slopes measured"):
+    with refused("slopes"):
         measured_delay(replace(loop, slopes=slopes))
 
 
@@ -57,15 +61,14 @@ def test_lost_frames_here_and_there_change_neither_delay_nor_gain() -> None:
     assert open_loop_of(loop.part(kept), used).telemetry.trust.any(axis=1).mean() > 0.88
 
 
-@pytest.mark.parametrize(("fitted", "used"), [(1.37, 1.37), (1.67, 1.67), (2.06, 2.0)])
-def test_a_fitted_delay_is_used(fitted: float, used: float, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_fitted_delay_is_used(monkeypatch: pytest.MonkeyPatch) -> None:
     """Also where a whole number is within its error; what is close to one is that number."""
-    fits = SimpleNamespace(
-        best=lambda: LoopDelay(fitted, 0.4, 0.9, 0.1), of=lambda delay: LoopDelay(delay, 0.0, 0.8, 0.1)
-    )
-    monkeypatch.setattr(open_loop, "DelayFits", lambda *loop: fits)
-    found, chosen = measured_delay(recorded())
-    assert (found.delay_frames, chosen.delay_frames) == (fitted, used)
+    for fitted, used in ((1.37, 1.37), (1.67, 1.67), (2.06, 2.0)):
+        best = LoopDelay(fitted, 0.4, 0.9, 0.1)
+        fits = SimpleNamespace(best=lambda best=best: best, of=lambda delay: LoopDelay(delay, 0.0, 0.8, 0.1))
+        monkeypatch.setattr(open_loop, "DelayFits", lambda *loop, fits=fits: fits)
+        found, chosen = measured_delay(recorded())
+        assert (found.delay_frames, chosen.delay_frames) == (fitted, used)
 
 
 def test_infinite_slopes_count_as_not_measured() -> None:
@@ -86,5 +89,25 @@ def test_a_gain_at_the_limit_is_not_known() -> None:
     slopes = 0.1 * rng.standard_normal((800, 50))
     slopes[2:] -= commands[:-2] @ loop.interaction_matrix.T
     still = replace(loop, slopes=slopes, commands=commands, frame=np.arange(800), delay_frames=2.0)
-    with pytest.raises(InputError, match=r"centroid gain: cannot be known .* keep the integrator"):
+    with refused("centroid gain", "integrator"):
         measured_delay(still)
+
+
+def test_intervals_are_of_95_per_cent() -> None:
+    assert Measured("tilt", "px", -1.0, 0.5).interval == pytest.approx((-1.98, -0.02))
+    assert Measured("noise", "px", 1.0, 0.8).interval == pytest.approx((-0.568, 2.568))
+    low, high = Measured("r0", "m", 1.0, 0.8, is_positive=True).interval
+    assert low * high == pytest.approx(1.0)
+    assert plain_values(Measured("r0", "m", remark="why").as_values()) == {
+        "name": "r0",
+        "unit": "m",
+        "remark": "why",
+        **dict.fromkeys(("value", "error", "low", "high")),
+    }
+
+
+def test_slopes_of_noise_alone_tell_no_r0() -> None:
+    outer, r0 = outer_scale_and_r0(TurbulenceStrength(math.nan, math.nan, math.nan, math.nan))
+    assert math.isnan(outer.value)
+    assert math.isnan(r0.value)
+    assert "no more than their noise" in r0.remark

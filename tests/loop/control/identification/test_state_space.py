@@ -21,9 +21,9 @@ from tests.loop.control.control_cases import (
     TURBULENCE,
     telemetry,
 )
+from tests.refusals import refused
 from tests.shared_data import ROOT
 
-from faintspot.base.errors import InputError
 from faintspot.loop.control.base import CommandDelayLine
 from faintspot.loop.control.identification.model import Kalman, state_space, write_matrices
 from faintspot.loop.control.kalman.local_predictor import local_filter
@@ -56,6 +56,29 @@ def exported(model: Kalman, path: Path) -> dict[str, Any]:
     return matrices
 
 
+class Loop:
+    """A loop closed by exported matrices, whose commands are compared with the filter's."""
+
+    def __init__(self, model: Kalman, frames: int, tolerance: float) -> None:
+        self.line, self._tolerance = CommandDelayLine(12, 2, LIMIT), tolerance
+        self._filter, self._rows = model.controller(PLANT, self.line), iter(telemetry(frames).open_loop_px)
+        self.frames = self.limited = 0
+
+    def get_data(self, check: bool = False) -> np.ndarray:
+        """Return slopes, or a command where pyMilk's SHM does not wait for one."""
+        if not check:
+            return np.zeros((4, 3), np.float32)
+        residual = next(self._rows) + INTERACTION @ self.line.acting
+        self._filter.update(residual, np.sqrt(NOISE_PX2))
+        return np.asarray(residual / SCALE + REFERENCE)[:, None]
+
+    def set_data(self, command: np.ndarray) -> None:
+        expected = SIGN * self.line.latest
+        np.testing.assert_allclose(command.ravel() - FLAT, expected, rtol=0, atol=self._tolerance)
+        self.frames += 1
+        self.limited += int(np.abs(self.line.latest).max() == LIMIT)
+
+
 def test_the_lines_of_the_manual(model: Kalman, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     exported(model, Path("matrices.npz"))
@@ -63,57 +86,20 @@ def test_the_lines_of_the_manual(model: Kalman, tmp_path: Path, monkeypatch: pyt
     (block,) = (block for block in blocks if "np.load" in block and ("csr_matrix" in block) == model.is_local)
     run: dict[str, Any] = {}
     exec(block, run)
-    line = CommandDelayLine(12, 2, LIMIT)
-    tolerance = (3e-6 if model.is_local else 1e-6) * LIMIT  # a filter in single precision
-    alone, limited = model.controller(PLANT, line), 0
-    for open_loop in telemetry(200).open_loop_px:
-        slopes = (open_loop + INTERACTION @ line.acting) / SCALE
-        alone.update(SCALE * slopes, np.sqrt(NOISE_PX2))
-        command = run["control"](slopes + REFERENCE) - FLAT
-        np.testing.assert_allclose(command, SIGN * line.latest, rtol=0, atol=tolerance)
-        limited += int(np.abs(line.latest).max() == LIMIT)
-    assert 0 < limited < 200
-
-
-class Shared:
-    """Stand-in for pyMilk's SHM: slopes of a loop that the commands close."""
-
-    def __init__(self, name: str, loop: MilkLoop) -> None:
-        self._name, self._loop = name, loop
-
-    def get_data(self, check: bool = False) -> np.ndarray:
-        return self._loop.slopes() if check else np.zeros((4, 3), np.float32)
-
-    def set_data(self, command: np.ndarray) -> None:
-        self._loop.send(command)
-
-
-class MilkLoop:
-    """Loop whose commands are those of the filter, within float32: 4e-6 of 60."""
-
-    def __init__(self, model: Kalman) -> None:
-        self._line = CommandDelayLine(12, 2, LIMIT)
-        self._alone, self._rows = model.controller(PLANT, self._line), iter(telemetry(100).open_loop_px)
-        self.frames = 0
-
-    def slopes(self) -> np.ndarray:
-        residual = next(self._rows) + INTERACTION @ self._line.acting
-        self._alone.update(residual, np.sqrt(NOISE_PX2))
-        return np.asarray(residual / SCALE + REFERENCE)[:, None]
-
-    def send(self, command: np.ndarray) -> None:
-        assert command.shape == (4, 3)
-        np.testing.assert_allclose(command.ravel() - FLAT, SIGN * self._line.latest, rtol=0, atol=1e-5)
-        self.frames += 1
+    loop = Loop(model, 200, (3e-6 if model.is_local else 1e-6) * LIMIT)  # a filter in single precision
+    for _ in range(200):
+        loop.set_data(run["control"](loop.get_data(check=True)[:, 0]))
+    assert 0 < loop.limited < 200
 
 
 @pytest.mark.parametrize("model", ["dense"], indirect=True)
 def test_the_lines_for_milk(model: Kalman, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With a stand-in for pyMilk's SHM; float32: 4e-6 of 60."""
     pytest.importorskip("astropy.io.fits")
     monkeypatch.chdir(tmp_path)
     exported(model, Path("controller.fits"))
-    loop = MilkLoop(model)
-    interface = SimpleNamespace(SHM=lambda name: Shared(name, loop))
+    loop = Loop(model, 100, 1e-5)
+    interface = SimpleNamespace(SHM=lambda name: loop)
     for name in ("pyMilk", "pyMilk.interfacing", "pyMilk.interfacing.isio_shmlib"):
         monkeypatch.setitem(sys.modules, name, cast(ModuleType, interface))
     page = (ROOT / "docs" / "adapters" / "streams.md").read_text(encoding="utf-8")
@@ -123,25 +109,21 @@ def test_the_lines_for_milk(model: Kalman, tmp_path: Path, monkeypatch: pytest.M
     assert loop.frames == 100
 
 
-@pytest.mark.parametrize("ending", ["npz", "mat", "fits"])
-def test_every_format_holds_the_same_matrices(model: Kalman, tmp_path: Path, ending: str) -> None:
-    """All hold the same matrices."""
-    path = tmp_path / f"matrices.{ending}"
-    if ending == "fits":
-        fits = pytest.importorskip("astropy.io.fits")
-    matrices = exported(model, path)
-    if ending == "npz":
-        file = dict(np.load(path))
-    elif ending == "mat":
-        file = loadmat(path)
-    else:
-        with fits.open(path) as units:
-            file = {unit.name.lower(): np.array(unit.data) for unit in units[1:]}
-    assert np.ravel(file["delay_frames"]) == [2]
-    for name, matrix in matrices.items():
-        stored = file[name] if name in file else sparse_of(file, name)
-        assert sparse.issparse(stored) == sparse.issparse(matrix)
-        np.testing.assert_allclose(plain(stored), plain(matrix), rtol=1e-6)
+def test_every_format_holds_the_same_matrices(model: Kalman, tmp_path: Path) -> None:
+    fits = pytest.importorskip("astropy.io.fits")
+    paths = {ending: tmp_path / f"matrices.{ending}" for ending in ("npz", "mat", "fits")}
+    for path in paths.values():
+        matrices = exported(model, path)
+    with fits.open(paths["fits"]) as units:
+        of_fits = {unit.name.lower(): np.array(unit.data) for unit in units[1:]}
+    for file in (dict(np.load(paths["npz"])), loadmat(paths["mat"]), of_fits):
+        assert np.ravel(file["delay_frames"]) == [2]
+        for name, matrix in matrices.items():
+            stored = file[name] if name in file else sparse_of(file, name)
+            assert sparse.issparse(stored) == sparse.issparse(matrix)
+            np.testing.assert_allclose(plain(stored), plain(matrix), rtol=1e-6)
+    with refused(".npz, .mat, .fits"):
+        write_matrices(tmp_path / "matrices.csv", {})
 
 
 def sparse_of(file: dict[str, Any], name: str) -> Any:
@@ -151,8 +133,3 @@ def sparse_of(file: dict[str, Any], name: str) -> Any:
 
 def plain(matrix: Any) -> np.ndarray:
     return np.asarray(matrix.toarray() if sparse.issparse(matrix) else matrix)
-
-
-def test_other_endings_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"\.npz, \.mat, \.fits"):
-        write_matrices(tmp_path / "matrices.csv", {})

@@ -36,18 +36,12 @@ def both(model: SlopeModel = MODEL, largest: float = 1e30, steps: int = STEPS, *
     return list(zip((slow, fast), lines, strict=True))
 
 
-def noise(rng: np.random.Generator, largest: float) -> np.ndarray:
-    """Return errors that differ by a factor of four between slopes; a tenth was not measured."""
+def noise(rng: np.random.Generator, largest: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return errors, a tenth infinite, and covariances of x and y: correlations of 0.2 to 0.8."""
     error: np.ndarray = np.minimum(0.5 * rng.uniform(0.5, 2.0, M), largest)
     error[rng.random(M) < 0.1] = np.inf
-    return error
-
-
-def shared(rng: np.random.Generator, error: np.ndarray) -> np.ndarray:
-    """Return covariances of x and y: correlations of 0.2 to 0.8 where both were measured."""
     x, y = np.split(np.where(np.isfinite(error), error, 0.0), 2)
-    covariance: np.ndarray = rng.uniform(0.2, 0.8, M // 2) * x * y
-    return covariance
+    return error, rng.uniform(0.2, 0.8, M // 2) * x * y
 
 
 @pytest.mark.slow
@@ -63,8 +57,7 @@ def test_it_is_the_filter_in_numpy(
     rng, largest = np.random.default_rng(2), 0.45
     controllers = both(model, steps=steps, prior_std_px=prior, noise_factor=1.3)
     for slopes in FRAMES.open_loop_px:
-        error = noise(rng, 9.0 if prior is None else largest)
-        covariance = shared(rng, error)
+        error, covariance = noise(rng, 9.0 if prior is None else largest)
         expected = []
         for controller, line in controllers:
             expected.append(controller.expected())
@@ -101,28 +94,20 @@ def test_nonsense_is_replaced_by_the_integrator() -> None:
     assert np.abs(line.latest).max() <= 0.8
 
 
-def test_it_begins_from_what_the_mirror_holds() -> None:
-    controllers = both(prefers_plain=True)
-    held = np.linspace(-1.0, 1.0, COMMANDS)
+@pytest.mark.parametrize(("prefers_plain", "tolerance"), [(False, 1e-3), (True, 1e-9)])
+def test_it_begins_from_what_the_mirror_holds(prefers_plain: bool, tolerance: float) -> None:
+    """Without a single slope, from frame 20 on, the filter goes on by itself."""
+    controllers = both(prefers_plain=prefers_plain)
     for controller, line in controllers:
-        line.hold(held)
+        line.hold(np.linspace(-1.0, 1.0, COMMANDS))
         controller.begin()
-    for slopes in FRAMES.open_loop_px[:5]:
-        for controller, line in controllers:
-            controller.update(slopes + INTERACTION @ line.acting, np.full(M, 0.5))
-        np.testing.assert_allclose(controllers[1][1].latest, controllers[0][1].latest, rtol=0, atol=1e-9)
-    assert controllers[1][0].chosen == 1
-
-
-def test_nothing_measured_nothing_learnt() -> None:
-    """Without a single slope the filter goes on by itself: commands are those of its state."""
-    (slow, one), (fast, other) = both()
     for number, slopes in enumerate(FRAMES.open_loop_px[:30]):
         error = np.full(M, 0.5 if number < 20 else np.inf)
-        for controller, line in ((slow, one), (fast, other)):
+        for controller, line in controllers:
             controller.update((slopes + INTERACTION @ line.acting) * np.isfinite(error), error)
-        np.testing.assert_allclose(other.latest, one.latest, rtol=0, atol=1e-3)
-    assert np.isfinite(other.latest).all()
+        latest = [line.latest for _, line in controllers]
+        np.testing.assert_allclose(latest[1], latest[0], rtol=0, atol=tolerance)
+    assert controllers[1][0].chosen == prefers_plain
 
 
 def test_a_filter_that_runs_away_says_so() -> None:

@@ -128,10 +128,9 @@ def test_the_rule_equals_its_slow_form(prefers_plain: bool, computed: float, com
     assert np.count_nonzero(np.diff(chosen)) >= 2
 
 
-def driven(filters: float, integrators: float, frames: int, computed: float = math.inf) -> np.ndarray:
+def driven(filters: float, integrators: float, frames: int) -> np.ndarray:
     """Return what was chosen; whatever drives, the residual of the integrator is computed as 3."""
-    guard = new_guard(False, computed, 60, 36)
-    chosen = []
+    guard, chosen = new_guard(False, math.inf, 60, 36), []
     for _ in range(frames):
         chosen.append(guard["chosen"].item())
         learnt, plain = (filters, 3.0) if guard["chosen"] == 0 else (0.5, integrators)
@@ -139,27 +138,8 @@ def driven(filters: float, integrators: float, frames: int, computed: float = ma
     return np.array(chosen)
 
 
-def test_integrator_drives_first() -> None:
-    chosen = driven(0.8, 1.0, 500)
-    assert chosen[:60].all()
-    assert not chosen[62:].any()
-
-
-@pytest.mark.parametrize(
-    ("prefers_plain", "ratio", "drives"), [(False, 0.95, 1), (True, 0.98, 0), (False, 1.05, 0)]
-)
-def test_few_commands_follow_their_recording_unless_residuals_contradict(
-    prefers_plain: bool, ratio: float, drives: int
-) -> None:
-    """Residuals of two commands scatter so much that in 450 frames they show no difference of 2 %."""
-    guard, rng = new_guard(prefers_plain, math.inf, 60, 2), np.random.default_rng(1)
-    for plain in rng.chisquare(2, 450):
-        CHOOSE(guard, ratio * plain * math.exp(0.2 * rng.standard_normal()), plain)
-    assert guard["chosen"] == 1 - drives
-
-
 def test_filter_that_leaves_more_loses_the_mirror_though_its_model_says_less() -> None:
-    """Each time for twice as long."""
+    """Each time for twice as long; one that runs away, for good. The integrator drives first."""
     chosen = driven(1.5, 1.0, 4000)
     changes = np.flatnonzero(np.diff(chosen))
     assert changes[0] == 60
@@ -167,26 +147,7 @@ def test_filter_that_leaves_more_loses_the_mirror_though_its_model_says_less() -
     waits = changes[2::2] - changes[1:-1:2]
     assert waits[0] >= 500
     assert (np.diff(waits) > 0.9 * waits[:-1]).all()
-
-
-def test_runaway_loses_the_mirror_at_once_and_for_good() -> None:
-    chosen = driven(1e6, 1.0, 10_000)
-    assert np.count_nonzero(chosen == 0) == 1
-
-
-def test_growing_residual_loses_the_mirror_before_it_is_ten_times_as_large() -> None:
-    guard = new_guard(False, math.inf, 60, 36)
-    for _ in range(61):
-        CHOOSE(guard, 0.5, 1.0)
-    residual, frames = 0.5, 0
-    while guard["chosen"] == 0:
-        residual, frames = 1.2 * residual, frames + 1
-        CHOOSE(guard, residual, 3.0)
-    assert frames > 5  # not before it is as large as that of the integrator
-    assert residual < 10
-    for _ in range(5000):
-        CHOOSE(guard, 0.5, 1.0)
-    assert guard["chosen"] == 1
+    assert np.count_nonzero(driven(1e6, 1.0, 10_000) == 0) == 1
 
 
 def test_a_filter_that_becomes_worse_is_replaced_within_30_frames_without_false_alarms() -> None:
@@ -206,30 +167,23 @@ def test_a_filter_that_becomes_worse_is_replaced_within_30_frames_without_false_
     assert chosen[9030] == 1
 
 
-@pytest.mark.parametrize(
-    ("measure", "usual", "bad", "frames"),
-    [
+def test_a_filter_is_replaced_though_it_leaves_little() -> None:
+    """By commands at the limit, surprises, or slopes that are not used; not where the integrator has them."""
+    for measure, usual, bad, frames in (
         (AT_LIMIT, 0.0, 1.0, 20),
         (AT_LIMIT, 3.0, 3.0, None),
         (SURPRISE, 1.0, 2.5, 20),
         (SURPRISE, 1.3, 1.6, None),
         (LEFT_OUT, 0.0, 2.5, 30),
         (LEFT_OUT, 1.5, 1.8, None),
-    ],
-)
-def test_a_filter_is_replaced_though_it_leaves_little(
-    measure: int, usual: float, bad: float, frames: int | None
-) -> None:
-    """By commands at the limit, surprises, or slopes that are not used; not where the integrator has them."""
-    guard = new_guard(False, math.inf, 60, 36)
-    chosen = []
-    for number in range(400):
-        driving = guard["chosen"] == 0
-        guard["measures"][SURPRISE] = 1.0
-        guard["measures"][measure] = bad if driving and number > 100 else usual
-        CHOOSE(guard, 0.5, 1.0)
-        chosen.append(guard["chosen"].item())
-    assert not any(chosen[65:101])
-    assert any(chosen[101:]) == (frames is not None)
-    if frames is not None:
-        assert chosen[100 + frames] == 1
+    ):
+        guard, chosen = new_guard(False, math.inf, 60, 36), []
+        for number in range(400):
+            driving = guard["chosen"] == 0
+            guard["measures"][SURPRISE] = 1.0
+            guard["measures"][measure] = bad if driving and number > 100 else usual
+            CHOOSE(guard, 0.5, 1.0)
+            chosen.append(guard["chosen"].item())
+        assert not any(chosen[65:101])
+        assert any(chosen[101:]) == (frames is not None)
+        assert frames is None or chosen[100 + frames] == 1

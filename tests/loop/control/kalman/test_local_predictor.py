@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from tests.loop.control.control_cases import CELLS, FRAME_S, LAYERS, PLANT, TURBULENCE, telemetry
 from tests.loop.control.frozen_flow import frozen_slopes
+from tests.refusals import refused
 
-from faintspot.base.errors import InputError
 from faintspot.loop.control.base import CommandDelayLine
 from faintspot.loop.control.identification import model as models
 from faintspot.loop.control.identification.learning import learn_controller
@@ -133,15 +133,10 @@ def test_errors_die_away() -> None:
 
     Gains made for the covariance of the best filter let errors with periods of six sub-apertures grow.
     """
-    cells = np.array([[row, column] for row in range(14) for column in range(14)], np.float64)
-    winds = np.array([[5.6, 2.1], [2.1, 11.8], [-7.5, -20.7]])
-    air = replace(
-        TURBULENCE,
-        positions_m=0.5 * cells,
-        subaperture_m=0.5,
-        fraction=np.array([0.6, 0.25, 0.15]),
-        wind_m_per_s=winds,
-    )
+    positions: Any = 0.5 * np.argwhere(np.ones((14, 14)))
+    winds = [[5.6, 2.1], [2.1, 11.8], [-7.5, -20.7]]
+    layers: Any = {"fraction": np.array([0.6, 0.25, 0.15]), "wind_m_per_s": np.array(winds)}
+    air = replace(TURBULENCE, positions_m=positions, subaperture_m=0.5, **layers)
     usual = np.full(392, float(np.diag(air.covariance_px2()).mean()))
     predictor = LocalPredictor(local_filter(air.layers(), 1 / 500, usual))
     assert max(predictor.remaining(air.positions_m, level) for level in range(7)) < 0.9995
@@ -192,8 +187,8 @@ def test_it_predicts_nearly_as_well_as_the_full_filter() -> None:
     """5 x 5 sub-apertures in frozen flow that shares nothing with the theory: 12 % of the error's variance
     are allowed for what is left out, with 3 % of scatter between realisations.
     """
-    cells = np.array([[row, column] for row in range(5) for column in range(5)], np.float64)
-    air = replace(TURBULENCE, positions_m=cells * SIDE_M, r0_m=0.26)
+    positions: Any = SIDE_M * np.argwhere(np.ones((5, 5)))
+    air = replace(TURBULENCE, positions_m=positions, r0_m=0.26)
     rng = np.random.default_rng(3)
     slopes = frozen_slopes(air, 700, 1 / FRAME_S, rng)
     noise_px = float(slopes.std())
@@ -206,21 +201,16 @@ def test_it_predicts_nearly_as_well_as_the_full_filter() -> None:
     assert dense < 0.2 * np.square(slopes).mean()
 
 
-def test_what_was_not_measured_counts_nothing(arrays: dict[str, Any]) -> None:
+def test_what_was_not_measured_counts_nothing_and_noisier_frames_less(arrays: dict[str, Any]) -> None:
     predictor, other = LocalPredictor(arrays), LocalPredictor(arrays)
     slopes, variance = np.random.default_rng(1).standard_normal(18), np.full(18, 0.25)
     variance[3] = np.inf
     predictor.correct(slopes, variance)
     other.correct(np.where(np.arange(18) == 3, 99.0, slopes), variance)
     np.testing.assert_array_equal(predictor.mean_px, other.mean_px)
-    assert np.abs(predictor.mean_px).max() > 0
-    before = predictor.mean_px
+    before, moved = predictor.mean_px, []
     predictor.correct(slopes, np.full(18, np.inf))
     np.testing.assert_array_equal(predictor.mean_px, before)
-
-
-def test_noisier_frames_correct_less(arrays: dict[str, Any]) -> None:
-    moved = []
     for noise_px2 in (0.02, 0.25, 3.0, 1e5):
         predictor = LocalPredictor(arrays)
         predictor.correct(np.ones(18), np.full(18, noise_px2))
@@ -262,9 +252,7 @@ def test_large_sensors_learn_it(monkeypatch: pytest.MonkeyPatch, tmp_path: Path)
             controller.update(slopes + PLANT.interaction @ line.acting, np.full(18, 0.3))
         sent.append(line.latest.copy())
     np.testing.assert_array_equal(sent[0], sent[1])
-    broken = replace(again, arrays={**again.arrays, "near": again.arrays["near"][:4]})
-    with pytest.raises(InputError, match="near"):
-        broken.check(PLANT)
-    beyond = replace(again, arrays={**again.arrays, "around": again.arrays["around"] + 9})
-    with pytest.raises(InputError, match="around"):
-        beyond.check(PLANT)
+    damaged = {"near": again.arrays["near"][:4], "around": again.arrays["around"] + 9}
+    for name, array in damaged.items():
+        with refused(name):
+            replace(again, arrays={**again.arrays, name: array}).check(PLANT)

@@ -80,22 +80,17 @@ def test_a_mode_that_was_not_measured_corrects_nothing() -> None:
 
 
 @pytest.mark.parametrize("arrays", [ARRAYS, COUPLED])
-def test_a_reply_is_what_a_surprise_adds_to_the_prediction(arrays: dict[str, np.ndarray]) -> None:
-    predictor = ModalPredictor(arrays)
-    predictor.correct(np.array([1.0, 2.0]), np.full(2, NOISE))
-    (reply,) = predictor.replies(2)
-    np.testing.assert_allclose(reply @ [1.0, 2.0], predictor.ahead(2))
-
-
-@pytest.mark.parametrize("arrays", [ARRAYS, COUPLED])
-def test_matrices_predict_as_the_filter_does(arrays: dict[str, np.ndarray]) -> None:
+def test_matrices_and_replies_predict_as_the_filter_does(arrays: dict[str, np.ndarray]) -> None:
+    """A reply is what the first surprise adds to the prediction."""
     predictor, rng = ModalPredictor(arrays), np.random.default_rng(3)
+    (reply,) = predictor.replies(2)
     onward, correction, observation, ahead = predictor.matrices(2)
     state = np.zeros(len(onward))
-    for row in rng.standard_normal((40, 2)):
+    for number, row in enumerate(rng.standard_normal((40, 2))):
         predictor.correct(row, np.full(2, NOISE))
         state = state + correction @ (row - observation @ state)
         np.testing.assert_allclose(ahead @ state, predictor.ahead(2), atol=1e-12)
+        assert number or reply @ row == pytest.approx(predictor.ahead(2))
         predictor.advance()
         state = onward @ state
 
@@ -104,10 +99,7 @@ def test_the_past_of_the_first_mode_corrects_all() -> None:
     """By the estimate of 8 frames ago, where the coupling is that alone."""
     coupling = np.zeros((len(LAGS), 2))
     coupling[1] = 1.0, -2.0
-    alone, coupled = (
-        ModalPredictor(COUPLED | {"coupling": np.zeros((1, 2))}),
-        ModalPredictor(COUPLED | {"coupling": coupling}),
-    )
+    alone, coupled = (ModalPredictor(COUPLED | {"coupling": each}) for each in (np.zeros((1, 2)), coupling))
     for predictor in alone, coupled:
         predictor.begin(np.array([3.0, 1.0]))
     np.testing.assert_allclose(coupled.ahead(2) - alone.ahead(2), [3.0, -6.0])
@@ -131,21 +123,12 @@ def both() -> tuple[list[GuardedController], list[CommandDelayLine]]:
     options: dict[str, Any] = {"prior_std_px": np.full(M, 0.7), "noise_factor": 1.3}
 
     def learnt(line: CommandDelayLine) -> Predictive:
-        return Predictive(
-            line, INTERACTION, LocalPredictor(arrays), PLANT.reconstructor.clean, from_latest=True
-        )
+        predictor = LocalPredictor(arrays)
+        return Predictive(line, INTERACTION, predictor, PLANT.reconstructor.clean, from_latest=True)
 
+    fast = LargeGuarded(lines[1], PLANT, PHASE_OF_COMMANDS, arrays, GAIN, **options)
     plain = partial(PLANT.integrator, GAIN)
-    fast = LargeGuarded(
-        lines[1],
-        PLANT,
-        PHASE_OF_COMMANDS,
-        arrays,
-        GAIN,
-        **options,
-    )
-    slow = Guarded(lines[0], INTERACTION, PHASE, learnt, plain, **options)
-    return [slow, fast], lines
+    return [Guarded(lines[0], INTERACTION, PHASE, learnt, plain, **options), fast], lines
 
 
 @pytest.mark.parametrize("fails", mostly_slow(1, [True, False]))
@@ -189,7 +172,7 @@ def test_a_command_that_is_begun_while_slopes_are_measured_is_the_same(
     arrays, rng, chosen = wrong_filter(), np.random.default_rng(3), []
     lines = [CommandDelayLine(COMMANDS, 2, 0.8) for _ in range(2)]
     others = PLANT, PHASE_OF_COMMANDS, arrays, GAIN
-    whole, begun = (LargeGuarded(line, *others, noise_factor=1.3) for line in lines)
+    both = whole, begun = [LargeGuarded(line, *others, noise_factor=1.3) for line in lines]
     n = M // 2
     for number, open_loop in enumerate(FRAMES.open_loop_px):
         slopes = (2.0 * (open_loop + INTERACTION @ lines[0].acting)).astype(np.float32)
@@ -204,10 +187,10 @@ def test_a_command_that_is_begun_while_slopes_are_measured_is_the_same(
         flags[0] = 1  # found out after the frame
         valid[[0, n]] = False
         true = np.where(valid, 0.5 * slopes.astype(np.float64), 0.0)
-        for controller in (whole, begun):
+        for controller in both:
             controller.update(true, np.where(valid, error, np.inf))
         np.testing.assert_allclose(lines[1].latest, lines[0].latest, rtol=1e-4, atol=1e-4)
-        for controller in (whole, begun):
+        for controller in both:
             controller.expected()
         assert whole.chosen == begun.chosen
         chosen.append(begun.chosen)

@@ -38,22 +38,12 @@ def test_yule_walker_gives_back_a_model() -> None:
 
 
 @MODELS
-def test_ahead_repeats_the_recursion(model: SlopeModel) -> None:
-    onward, _, seen = _textbook(model)
+def test_state_and_error_follow_the_recursion(model: SlopeModel) -> None:
+    onward, driving, seen = _textbook(model)
     np.testing.assert_allclose(model.ahead(0), seen)
     np.testing.assert_allclose(model.ahead(3), seen @ onward @ onward @ onward, atol=1e-12)
-
-
-@MODELS
-def test_an_error_spreads_as_the_state_does(model: SlopeModel) -> None:
-    onward, driving, _ = _textbook(model)
     once = onward @ driving @ onward.T + driving
     np.testing.assert_allclose(model.spread(driving, 2), onward @ once @ onward.T + driving, atol=1e-12)
-
-
-@MODELS
-def test_the_steady_error_solves_the_riccati_equation(model: SlopeModel) -> None:
-    onward, driving, seen = _textbook(model)
     variance = np.linspace(0.05, 0.5, model.slopes)
     expected = solve_discrete_are(onward.T, seen.T, driving, np.diag(variance))
     np.testing.assert_allclose(steady_covariance(model, variance), expected, atol=1e-8)
@@ -66,6 +56,9 @@ def test_the_filter_is_the_textbook_s(model: SlopeModel, steady: bool) -> None:
     onward, driving, seen = _textbook(model)
     variance = ERRORS**2
     predictor = SlopePredictor(model, variance, steady=steady)
+    before = predictor.state.copy()
+    predictor.correct(np.full(model.slopes, 1e3), np.full(model.slopes, np.inf))  # not measured
+    np.testing.assert_array_equal(predictor.state, before)
     state, error = np.zeros(model.states), predictor.covariance
     for slopes in telemetry(60).open_loop_px:
         predictor.correct(slopes.copy(), variance)
@@ -90,14 +83,6 @@ def test_predictions_are_as_far_off_as_they_say() -> None:
         predictor.advance()
     said = np.sqrt(predictor.std_px**2 + 0.3**2)
     assert np.std(surprise, axis=0).mean() == pytest.approx(said.mean(), rel=0.05)
-
-
-@pytest.mark.parametrize("steady", [True, False])
-def test_what_was_not_measured_does_not_count(steady: bool) -> None:
-    predictor = SlopePredictor(MODEL, ERRORS**2, steady=steady)
-    before = predictor.state.copy()
-    predictor.correct(np.full(18, 1e3), np.full(18, np.inf))
-    np.testing.assert_array_equal(predictor.state, before)
 
 
 def test_a_filter_begins_at_the_slopes_it_is_given() -> None:
