@@ -25,6 +25,7 @@ def test_shapes_and_consistency(measured: dict[str, Any]) -> None:
     methods, modes = len(SMALL.estimators), len(SMALL.modes)
     for name in ("error", "error_se", "chosen_k", "chosen_candidate", "invalid_fraction"):
         assert measured[name].shape == (methods, modes), name
+    assert not measured["invalid_fraction"].any()  # every spot of 60 electrons is seen
     assert measured["error_covariance"].shape == (modes, methods, methods)
     assert measured["error_at_k"].shape == measured["error_at_k_se"].shape == (methods, 63)
     variances = np.diagonal(measured["error_covariance"], axis1=1, axis2=2).T
