@@ -8,7 +8,9 @@ from tests.patience import mostly_slow
 
 from faintspot.loop.slope_covariance import ARCSEC, SlopeTurbulence
 from faintspot.loop.turbulence_strength import (
+    _SCALES_M,
     TurbulenceStrength,
+    _fitted,
     differential_image_motion,
     turbulence_strength,
 )
@@ -49,6 +51,13 @@ def test_known_turbulence_is_found_within_its_errors(slopes: np.ndarray, noise_p
     known = found(slopes + noise, outer_scale_m=25.0)
     assert known.outer_scale_m == pytest.approx(25)
     assert known.r0_error_m < strength.r0_error_m
+
+
+def test_one_variance_leaves_the_outer_scale_of_most_sites() -> None:
+    """Whatever the outer scale, a strength fits it exactly; the scales that are tried end at 4 and 250 m."""
+    fitted = _fitted(np.zeros(1), np.zeros((len(_SCALES_M), 1)), np.eye(1), None)
+    assert fitted.outer_scale_m == pytest.approx(25.0, rel=0.05)
+    assert fitted.outer_scale_error_m == pytest.approx(0.7 * 25.0, rel=0.1)
 
 
 @pytest.mark.slow

@@ -5,7 +5,16 @@ import numpy as np
 import pytest
 
 from faintspot.loop.control.identification.open_loop import Measured
-from faintspot.loop.telemetry.choices import AS_RUN, BEST, FILTER, ControlChoice, _saved, _signed_root, advice
+from faintspot.loop.telemetry.choices import (
+    AS_RUN,
+    BEST,
+    FILTER,
+    ControlChoice,
+    _root,
+    _saved,
+    _signed_root,
+    advice,
+)
 
 
 def choice(name: str, residual: float, less: float, error: float, gain: float = math.nan) -> ControlChoice:
@@ -30,6 +39,7 @@ def test_the_choice_that_saves_most_is_recommended() -> None:
 
 def test_roots_are_as_significant_as_their_squares() -> None:
     for square, (error, significant) in product((-100.0, 100.0), ((60.0, False), (45.0, True), (5.0, True))):
+        assert _root("", "nm", square, error).value == math.copysign(10.0, square)
         low, high = _signed_root("", "nm", square, error).interval
         assert (low > 0 or high < 0) == significant
 

@@ -15,6 +15,7 @@ from faintspot.loop.control.identification.layers import Identified
 from faintspot.loop.control.identification.loop_delay import LoopDelay
 from faintspot.loop.control.identification.open_loop import (
     Measured,
+    freed_of_prior,
     measured_delay,
     open_loop_of,
     outer_scale_and_r0,
@@ -104,6 +105,17 @@ def test_intervals_are_of_95_per_cent() -> None:
         "remark": "why",
         **dict.fromkeys(("value", "error", "low", "high")),
     }
+
+
+def test_slopes_that_were_expected_stay_without_the_prior() -> None:
+    """What was expected is what the commands of two frames ago have added, and the latest takes away."""
+    loop = replace(recorded().part(slice(0, 6)), delay_frames=2.0)
+    sent = loop.commands @ loop.interaction_matrix.T
+    slopes = np.vstack([np.zeros((2, 50)), [sent[k - 2] - sent[k - 1] for k in range(2, 6)]])
+    loop = replace(loop, slopes=slopes, standard_errors=np.full(slopes.shape, 0.5), prior_std=np.ones(50))
+    np.testing.assert_allclose(freed_of_prior(loop, is_predicted=True).slopes, slopes, atol=1e-12)
+    # A posterior of a quarter of the prior's variance: the frame alone lies 4 / 3 as far from 0.
+    np.testing.assert_allclose(freed_of_prior(loop, is_predicted=False).slopes, slopes * 4 / 3)
 
 
 def test_slopes_of_noise_alone_tell_no_r0() -> None:
