@@ -58,8 +58,8 @@ METHODS: list[tuple[str, tuple[str, ...]]] = [
     ("noise_std=", ("noise_std=",)),
     ("tv:", ("noise_std=",)),
     ("kalmann", ("'kalmann'",)),
-    ("tv+", ("NAME=VALUE",)),
-    ("tv+none", ("'none'",)),
+    ("tv+", ("'tv+'", "NAME=VALUE")),
+    ("tv+none", ("'tv+none'", "NAME=VALUE")),
     ("tv+kalman+tv", ("'kalman'",)),
     ("ml:2", ("'ml:2'",)),
 ]

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from faintspot.base.checks import number_between
-from faintspot.base.errors import InputError
+from faintspot.base.errors import InputError, errors_within
 from faintspot.base.tables import parse_changes
 from faintspot.engine.settings.running_settings import check_names
 from faintspot.loop.control.base import CONTROLS, split_control
@@ -155,7 +155,8 @@ def _parsed_settings(text: str) -> InterleavedMethod:
     if colon:
         others = [f"{_strength_option(text, name)}={strength}", *others]
     if others:
-        changes |= parse_changes(others)
+        with errors_within(f"interleave: {text!r}"):
+            changes |= parse_changes(others)
         check_names(list(changes))
     return InterleavedMethod(text, changes, denoises=first != _NONE)
 
