@@ -16,7 +16,7 @@ from tests.shared_data import ROOT
 MANUAL = ROOT / "docs" / "adapters"
 STREHL = r"Strehl ratio ([\d.]+)"
 SHORTER = {
-    "hcipy": {"np.arange(100, 2250)": "np.arange(100, 600)", "np.arange(2250, 2950)": "np.arange(600, 740)"},
+    "hcipy": {"np.arange(100, 2250)": "np.arange(100, 600)", "np.arange(2250, 2950)": "np.arange(600, 850)"},
     "oopao": {"signal, 2150)": "signal, 600)", "run(predictive, 700)": "run(predictive, 250)"},
     "specula": {
         "total_time: 8.6": "total_time: 2.0",
