@@ -6,5 +6,5 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[Any]
-"""Of a kernel: its type is that of the lanes, or stands in the record or docstring."""
+"""Array that a kernel takes: of the type of the lanes, or of the one that its record or docstring states."""
 Floats = NDArray[np.float64]

@@ -15,7 +15,8 @@ from tests.refusals import refused
 
 from faintspot.loop.control import beside_the_loop
 from faintspot.loop.control.base import ASSUMED, OpenLoopTelemetry
-from faintspot.loop.control.identification.learning import GAINS, error_of_mean, learn_controller
+from faintspot.loop.control.beside_the_loop import error_of_mean
+from faintspot.loop.control.identification.learning import GAINS, learn_controller
 from faintspot.loop.control.identification.loop_delay import DelayFits, LoopDelay
 from faintspot.loop.control.identification.model import Kalman
 from faintspot.loop.control.identification.predictive_control import PredictiveControl, learn

@@ -133,7 +133,10 @@ def short_names(methods: Sequence[str]) -> list[str]:
 def _parsed_method(text: str) -> InterleavedMethod:
     """Return a method: settings, a controller, or both joined with "+"."""
     measured, control = split_control(text)
-    method = _parsed_settings(measured or _SET if control else text)
+    measured = measured or _SET if control else text
+    with errors_within(f"interleave: {measured!r}"):
+        method = _parsed_settings(measured)
+    check_names(list(method.changes))
     return replace(method, label=text, control=control or None)
 
 
@@ -147,25 +150,21 @@ def _parsed_settings(text: str) -> InterleavedMethod:
         elif colon or "=" not in first:
             names = ", ".join([_SET, _NONE, *estimators()])
             raise InputError(
-                f"interleave: {text!r}: expected {names}, ESTIMATOR:STRENGTH, NAME=VALUE or one of "
-                f"{', '.join(CONTROLS)}; several joined with +, the controller last"
+                f"expected {names}, ESTIMATOR:STRENGTH, NAME=VALUE or one of {', '.join(CONTROLS)}; "
+                "several joined with +, the controller last"
             )
         else:
             others = [first, *others]
     if colon:
-        others = [f"{_strength_option(text, name)}={strength}", *others]
+        others = [f"{_strength_option(name)}={strength}", *others]
     if others:
-        with errors_within(f"interleave: {text!r}"):
-            changes |= parse_changes(others)
-        check_names(list(changes))
+        changes |= parse_changes(others)
     return InterleavedMethod(text, changes, denoises=first != _NONE)
 
 
-def _strength_option(text: str, name: str) -> str:
+def _strength_option(name: str) -> str:
     """Return the option of an estimator that ESTIMATOR:STRENGTH sets."""
     option = estimators()[name].strength_option
     if option is None:
-        raise InputError(
-            f"interleave: {text!r}: expected {name} alone or with +NAME=VALUE; it has no strength"
-        )
+        raise InputError(f"expected {name} alone or with +NAME=VALUE; it has no strength")
     return option

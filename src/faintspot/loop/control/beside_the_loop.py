@@ -1,6 +1,7 @@
-"""Learning in a process beside the loop: recent frames, the process, and a replay that judges what came."""
+"""Learning in a process beside the loop: recent frames, the process, and what judges the filter that came."""
 
 import contextlib
+import math
 import os
 import pickle
 import subprocess
@@ -28,6 +29,10 @@ _CALL = (
     "import pickle, sys; result, sys.stdout = sys.stdout.buffer, sys.stderr; "
     "function, arguments = pickle.load(sys.stdin.buffer); pickle.dump(function(*arguments), result)"
 )
+
+STANDARD_ERRORS = 2.0
+"""By which a filter must be better to replace another one."""
+BLOCK_FRAMES = 25
 
 Result = TypeVar("Result")
 
@@ -135,3 +140,12 @@ def replayed_slopes(
         sent.append(control(np.where(np.isfinite(variance), residual, np.nan)))
         squares.append(float(np.square(controlled @ residual).mean()))
     return np.array(squares)
+
+
+def error_of_mean(values: Floats) -> float:
+    """Return the standard error of the mean of correlated values, from the scatter of blocks."""
+    blocks = len(values) // BLOCK_FRAMES
+    means = values[: blocks * BLOCK_FRAMES].reshape(blocks, BLOCK_FRAMES).mean(axis=1)
+    with np.errstate(invalid="ignore"):
+        error = float(means.std(ddof=1)) / math.sqrt(blocks)
+    return error if math.isfinite(error) else math.inf

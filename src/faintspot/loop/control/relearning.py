@@ -5,14 +5,9 @@ from dataclasses import dataclass, replace
 
 from faintspot.base.errors import InputError
 from faintspot.loop.control.base import SETTLE_FRAMES, OpenLoopTelemetry
+from faintspot.loop.control.beside_the_loop import BLOCK_FRAMES, STANDARD_ERRORS, error_of_mean
 from faintspot.loop.control.identification.layers import Identified
-from faintspot.loop.control.identification.learning import (
-    BLOCK_FRAMES,
-    JUDGED_PART,
-    STANDARD_ERRORS,
-    error_of_mean,
-    learn_controller,
-)
+from faintspot.loop.control.identification.learning import JUDGED_PART, learn_controller
 from faintspot.loop.control.identification.loop_delay import LoopDelay
 from faintspot.loop.control.identification.model import Kalman
 from faintspot.loop.control.integrator import LoopPlant

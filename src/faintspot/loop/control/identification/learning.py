@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from faintspot.base.arrays import Floats
 from faintspot.loop.control.base import ASSUMED, LEARNT, OpenLoopTelemetry
 from faintspot.loop.control.flattening import phase_of_commands
 from faintspot.loop.control.identification.layers import AVERAGED, Identification, Identified
@@ -19,8 +18,6 @@ GAINS = (0.03, 0.05, 0.07, 0.1, 0.13, 0.16, 0.2, 0.25, 0.3, 0.36, 0.43, 0.5, 0.6
 _MOST_REPLAYED, _FEWEST_REPLAYED = 1_200_000, 500  # slopes, and frames, by which controllers are compared
 JUDGED_PART = 0.35
 """Part of a stretch, its end, on which models are judged; they are learnt from the rest."""
-STANDARD_ERRORS = 2.0
-BLOCK_FRAMES = 25
 
 
 def learn_controller(
@@ -82,12 +79,3 @@ def _fits(
         return [anywhere]
     # A line that the winds explain is no vibration in either model.
     return [windy, replace(anywhere, vibrations=windy.vibrations)]
-
-
-def error_of_mean(values: Floats) -> float:
-    """Return the standard error of the mean of correlated values, from the scatter of blocks."""
-    blocks = len(values) // BLOCK_FRAMES
-    means = values[: blocks * BLOCK_FRAMES].reshape(blocks, BLOCK_FRAMES).mean(axis=1)
-    with np.errstate(invalid="ignore"):
-        error = float(means.std(ddof=1)) / math.sqrt(blocks)
-    return error if math.isfinite(error) else math.inf

@@ -13,9 +13,16 @@ from faintspot.base.arrays import Floats
 from faintspot.base.checks import one_of, real_array
 from faintspot.base.errors import InputError
 from faintspot.loop.control.base import SETTLE_FRAMES, CommandDelayLine
-from faintspot.loop.control.beside_the_loop import FRAMES, BesideTheLoop, RecentFrames, replayed_slopes
+from faintspot.loop.control.beside_the_loop import (
+    FRAMES,
+    STANDARD_ERRORS,
+    BesideTheLoop,
+    RecentFrames,
+    error_of_mean,
+    replayed_slopes,
+)
 from faintspot.loop.control.identification.layers import Identified
-from faintspot.loop.control.identification.learning import JUDGED_PART, STANDARD_ERRORS, error_of_mean
+from faintspot.loop.control.identification.learning import JUDGED_PART
 from faintspot.loop.control.identification.learnt_loop import (
     ObservedLoop,
     control_from_observed,

@@ -35,9 +35,10 @@ SLOPE_ROWS = 16
 MADE, LEFT, OFFSET = 4, 5, 7
 COMMAND_ROWS = 8
 
-
 Rows = tuple[int, int, int]
+"""Where the next commands of `Lines` go."""
 Numbers = tuple[float, float, Array, int]
+"""The integrator's gain, what it keeps of its command, stroke, steps of conjugate gradients."""
 
 
 class Matrices(NamedTuple):

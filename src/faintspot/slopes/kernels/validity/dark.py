@@ -46,7 +46,7 @@ BRIGHT_E = 100.0
 SUSPECT = 0.5
 """Flux over the typical one below which the pixels of a window are looked at."""
 MOST_LANES = 8
-"""Largest number of pixels at once: windows are rarely wider, and each number is compiled for itself."""
+"""Largest number of pixels at once: windows are rarely wider, and code is compiled for each number."""
 _ABSOLUTE_TO_STD = 0.5 * math.sqrt(math.pi)  # of the mean absolute difference of two pixels
 
 
